@@ -1,0 +1,311 @@
+"""A furnished apartment, a depth camera carried through it, and the exact distances it saw."""
+
+# mujoco's bindings carry no types that pyright can see.
+# pyright: reportAttributeAccessIssue=false
+
+from importlib import resources
+
+import mujoco
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from hiosdf_jax.demo.primitives import signed_distance
+from hiosdf_jax.evaluation import GroundTruth
+
+# The rooms span (0, 0, 0) to (10, 8, 2.6) m and the walls are 0.15 m thick.
+BOUNDS_WORLD = ((-0.2, -0.2, -0.2), (10.2, 8.2, 2.8))  # m
+
+_CAMERA_HEIGHT = 1.2  # m
+_PITCH = np.radians(12)  # downwards: furniture is low
+# x (m), y (m), and the gaze relative to the direction of travel (degrees, positive to the left).
+_WAYPOINTS = np.array(
+    [
+        # living room
+        (4.55, 3.45, 0),
+        (3.75, 3.35, -35),
+        (3.05, 2.75, -20),
+        (2.95, 1.95, 35),
+        (3.45, 1.40, 15),
+        (4.40, 1.32, 60),
+        (5.05, 1.32, 10),
+        (5.65, 1.325, 0),  # door
+        # kitchen
+        (6.30, 1.32, 20),
+        (7.10, 1.30, -50),
+        (7.90, 1.30, 35),
+        (8.70, 1.38, 10),
+        (9.25, 1.95, 40),
+        (9.35, 2.80, 75),
+        (9.35, 3.60, 25),
+        (9.375, 4.45, 0),  # door
+        # hall
+        (9.20, 5.20, 20),
+        (8.80, 6.05, -25),
+        (8.25, 6.60, -40),
+        (7.45, 6.775, -10),  # door
+        # bedroom
+        (6.80, 6.60, 15),
+        (6.35, 6.00, 35),
+        (5.60, 5.55, 10),
+        (4.75, 5.50, -45),
+        (3.95, 5.50, -30),
+        (3.25, 5.475, -35),  # door
+        # study
+        (2.65, 5.65, -75),
+        (2.10, 5.85, -75),
+        (1.60, 5.70, -65),
+        (1.40, 5.15, -35),
+        (1.375, 4.45, 0),  # door
+        # living room again
+        (1.60, 3.95, -20),
+        (2.20, 3.70, -30),
+        (2.90, 3.60, -20),
+        (3.50, 3.60, 0),
+    ]
+)
+
+_MIN_RANGE = 0.3  # m, a depth camera is blind nearer than that
+_DROP_OUT = 0.005  # share of the pixels that see nothing for no reason
+_FLYING = 0.15  # share of the pixels at a depth edge that mix foreground and background
+_EDGE = 0.1  # step of depth between neighbours, relative to the nearer one, that makes an edge
+
+
+def load_model() -> mujoco.MjModel:
+    """Loads the apartment: about 290 boxes, spheres, capsules and cylinders, none of which moves.
+
+    Returns:
+      The model; metres, z up. Geoms less than 5 cm thick have names that begin with "thin_".
+    """
+    xml = resources.files("hiosdf_jax.demo").joinpath("apartment.xml").read_text("utf-8")
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def camera_path(frames: int) -> np.ndarray:
+    """Lays a smooth path through all rooms, on which no obstacle is nearer than 0.3 m.
+
+    Args:
+      frames: how many poses, >= 1, of a path of 25.5 m; they lie closer where the camera turns.
+
+    Returns:
+      (frames, 4, 4) float64 T_world_sensor, metres; optical frame (x right, y down, z forward).
+
+    Raises:
+      ValueError: frames < 1.
+    """
+    if frames < 1:
+        raise ValueError(f"frames = {frames}, expected >= 1")
+    chords = np.linalg.norm(np.diff(_WAYPOINTS[:, :2], axis=0), axis=1)
+    knots = np.concatenate([[0], np.cumsum(chords)])
+    position = CubicSpline(knots, _WAYPOINTS[:, :2])
+    gaze = PchipInterpolator(knots, _WAYPOINTS[:, 2])
+
+    dense = np.linspace(0, knots[-1], 8001)
+    xy, velocity = position(dense), position(dense, 1)
+    yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0])) + np.radians(gaze(dense))
+    # Whoever carries a camera slows down to turn: frames are even in metres plus radians.
+    steps = np.linalg.norm(np.diff(xy, axis=0), axis=1) + np.abs(np.diff(yaw))
+    pace = np.concatenate([[0], np.cumsum(steps)])
+    even = np.linspace(0, pace[-1], frames)
+    x, y, yaw = (np.interp(even, pace, values) for values in (xy[:, 0], xy[:, 1], yaw))
+
+    cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros(frames)
+    forward = np.stack([cos, sin, np.full(frames, -np.tan(_PITCH))], axis=1) * np.cos(_PITCH)
+    right = np.stack([sin, -cos, zero], axis=1)
+
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, 0] = right
+    poses[:, :3, 1] = np.cross(forward, right)
+    poses[:, :3, 2] = forward
+    poses[:, :3, 3] = np.stack([x, y, np.full(frames, _CAMERA_HEIGHT)], axis=1)
+    return poses
+
+
+class ApartmentStream:
+    """A depth camera that is carried through the apartment; a sequence of (cloud, pose).
+
+    Frames are rendered when they are asked for and depend on the arguments and the index only.
+    """
+
+    def __init__(
+        self,
+        frames: int = 80,
+        width: int = 160,
+        height: int = 120,
+        max_range: float = 6.0,
+        seed: int = 0,
+        noise: bool = True,
+    ) -> None:
+        """Prepares the camera; its horizontal field of view is 90 degrees.
+
+        Args:
+          frames: length of the stream; the path is the same for any, see `camera_path`.
+          width: pixels a row.
+          height: pixels a column.
+          max_range: metres along a ray; nothing farther, and nothing nearer than 0.3 m, returns.
+          seed: of the noise.
+          noise: whether depths are noisy (as a Kinect's), some pixels drop out, and some fly
+            between foreground and background at depth edges.
+
+        Raises:
+          ValueError: frames, width or height < 1, or max_range <= 0.3.
+        """
+        if width < 1 or height < 1:
+            raise ValueError(f"width, height = {width}, {height}, expected >= 1")
+        if not max_range > _MIN_RANGE:
+            raise ValueError(f"max_range = {max_range}, expected > {_MIN_RANGE}")
+        self.model = load_model()
+        self.poses_world_sensor = camera_path(frames)
+        self.height, self.width = height, width
+        self.max_range, self.seed, self.noise = max_range, seed, noise
+        self._data = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self._data)
+        # The ray through the middle of every pixel, with a depth (z) of 1.
+        focal = width / 2  # pixels: half the width spans 45 degrees
+        u = (np.arange(width) + 0.5 - width / 2) / focal
+        v = (np.arange(height) + 0.5 - height / 2) / focal
+        x, y = np.meshgrid(u, v)
+        self._rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+        self._lengths = np.linalg.norm(self._rays, axis=1)
+
+    def __len__(self) -> int:
+        """The number of frames."""
+        return len(self.poses_world_sensor)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Renders a frame.
+
+        Args:
+          index: 0 <= index < len(self).
+
+        Returns:
+          cloud: (height * width, 3) float32, metres, sensor frame, row by row of the image; a row
+            of NaN is no return.
+          pose: (4, 4) float32, T_world_sensor.
+
+        Raises:
+          IndexError: the index is out of range.
+        """
+        depth = self.exact_depth(index)
+        if self.noise:
+            depth = _add_noise(depth.reshape(self.height, self.width), (self.seed, index)).ravel()
+        depth = np.where(self._in_range(depth), depth, np.nan)
+        cloud = depth[:, None] * self._rays
+        return cloud.astype(np.float32), self.poses_world_sensor[index].astype(np.float32)
+
+    def exact_depth(self, index: int) -> np.ndarray:
+        """Casts the rays of a frame, with neither noise nor a limit of range.
+
+        Args:
+          index: 0 <= index < len(self).
+
+        Returns:
+          (height * width,) float64, depth along the optical axis in metres; finite, since the
+          apartment is closed.
+
+        Raises:
+          IndexError: the index is out of range.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"index = {index}, expected 0 <= index < {len(self)}")
+        pose = self.poses_world_sensor[index]
+        directions = (self._rays / self._lengths[:, None]) @ pose[:3, :3].T
+        count = len(directions)
+        ranges = np.empty(count)
+        mujoco.mj_multiRay(
+            m=self.model,
+            d=self._data,
+            pnt=pose[:3, 3],
+            vec=directions.ravel(),
+            geomgroup=None,  # every group
+            flg_static=True,  # static geoms, which all of these are, count
+            bodyexclude=-1,
+            geomid=np.empty(count, np.int32),
+            dist=ranges,
+            normal=None,
+            nray=count,
+            cutoff=mujoco.mjMAXVAL,
+        )
+        return ranges / self._lengths
+
+    def exact_surface(self, index: int) -> np.ndarray:
+        """Finds the surface points that a frame sees within the camera's limits of range.
+
+        Args:
+          index: 0 <= index < len(self).
+
+        Returns:
+          (n, 3) float64, metres, world; n <= height * width.
+
+        Raises:
+          IndexError: the index is out of range.
+        """
+        depth = self.exact_depth(index)
+        seen = self._in_range(depth)
+        pose = self.poses_world_sensor[index]
+        return depth[seen, None] * self._rays[seen] @ pose[:3, :3].T + pose[:3, 3]
+
+    def _in_range(self, depth: np.ndarray) -> np.ndarray:
+        ranges = depth * self._lengths
+        return (ranges >= _MIN_RANGE) & (ranges <= self.max_range)
+
+
+def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> GroundTruth:
+    """Draws points of the free space that a stream sees, with the exact distances there.
+
+    The frame of each point is drawn uniformly, then a pixel of the frame that sees a surface, then
+    the place on the ray between the sensor and that surface.
+
+    Args:
+      stream: whose exact rays, not its noise, say what is free.
+      count: how many points in free space, and how many on surfaces.
+      seed: of the draws.
+
+    Returns:
+      The exact distances; frame is the one that the point was drawn from.
+
+    Raises:
+      ValueError: a frame that was drawn sees no surface.
+    """
+    rng = np.random.default_rng(seed)
+    quotas = rng.multinomial(count, np.full(len(stream), 1 / len(stream)), size=2).T
+    free, surface, frames = [], [], []
+    for index, (free_quota, surface_quota) in enumerate(quotas):
+        seen = stream.exact_surface(index)
+        if not len(seen):
+            raise ValueError(f"frame {index} sees no surface within {stream.max_range} m")
+        origin = stream.poses_world_sensor[index, :3, 3]
+        along = rng.uniform(size=(free_quota, 1))
+        free.append(origin + along * (rng.choice(seen, free_quota) - origin))
+        surface.append(rng.choice(seen, surface_quota))
+        frames.append(np.full(free_quota, index, np.int32))
+    # Rounded before the distance is taken, so that it is exact at the very points handed out.
+    points = np.concatenate(free).astype(np.float32)
+    sdf, grad = signed_distance(stream.model, points)
+    return GroundTruth(
+        points_world=points,
+        sdf=sdf.astype(np.float32),
+        grad=grad.astype(np.float32),
+        frame=np.concatenate(frames),
+        surface_points_world=np.concatenate(surface).astype(np.float32),
+    )
+
+
+def _add_noise(depth: np.ndarray, seed: tuple[int, int]) -> np.ndarray:
+    """What a structured-light camera makes of exact depths (H, W), metres; NaN where it drops out.
+
+    The noise is that of the Kinect (Nguyen, Izadi, Lovell: Modeling Kinect Sensor Noise for
+    Improved 3D Reconstruction and Tracking, 3DIMPVT 2012).
+    """
+    rng = np.random.default_rng(seed)
+    height, width = depth.shape
+    # A pixel flies where it averages over an edge: somewhere between itself and a neighbour.
+    down, right = rng.integers(-1, 2, size=(2, height, width))
+    row, column = np.indices(depth.shape)
+    neighbour = depth[np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
+    at_edge = np.abs(neighbour - depth) > _EDGE * np.minimum(depth, neighbour)
+    flies = at_edge & (rng.uniform(size=depth.shape) < _FLYING)
+    mixed = depth + rng.uniform(size=depth.shape) * (neighbour - depth)
+    depth = np.where(flies, mixed, depth)
+
+    depth = depth + (0.0012 + 0.0019 * (depth - 0.4) ** 2) * rng.normal(size=depth.shape)
+    return np.where(rng.uniform(size=depth.shape) < _DROP_OUT, np.nan, depth)

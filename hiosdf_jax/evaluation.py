@@ -1,0 +1,229 @@
+"""Scores of a map against exact distances, and of any map against a table of peers.
+
+Everything here runs on the host and asks the map only through a callable, so that the same code
+scores our map, a baked field, a plain grid or somebody else's method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# One batch shape for every call: a jitted map compiles once. Small enough that the activations of
+# a wide network stay in tens of megabytes on a CPU, large enough to keep a GPU busy.
+_CHUNK = 8192
+_NEAR = 0.5  # m, "near" in near_cm
+_LOCAL_RADIUS = 3.0  # m, the paper's local SDF error
+_RADIUS_BOUNDS = (0.05, 0.4)  # m, robot spheres from a gripper's finger to a mobile base
+
+_METRICS = {  # key: (label, unit, which is better)
+    "visible_cm": ("error, visible region", "cm", "lower"),
+    "near_cm": ("error within 0.5 m of a surface", "cm", "lower"),
+    "within_3m_cm": ("error within 3 m of the sensor", "cm", "lower"),
+    "bias_cm": ("bias, map - truth", "cm", "nearer 0"),
+    "surface_cm": ("|sdf| on the surface", "cm", "lower"),
+    "median_cm": ("|sdf| on held-out returns, median", "cm", "lower"),
+    "mean_cm": ("|sdf| on held-out returns, mean", "cm", "lower"),
+    "p90_cm": ("|sdf| on held-out returns, 90 % below", "cm", "lower"),
+    "eikonal": ("||grad| - 1|", "-", "lower"),
+    "cosine": ("1 - cos(grad, true grad)", "-", "lower"),
+    "recall": ("collisions found", "-", "higher"),
+    "fpr": ("free spheres called colliding", "-", "lower"),
+}
+
+
+class GroundTruth(NamedTuple):
+    """Exact distances of a scene, at points that a sensor saw to be free.
+
+    Attributes:
+        points_world: (N, 3) float32, metres; points on rays between the sensor and the surface.
+        sdf: (N,) float32, metres; exact distance to the nearest surface.
+        grad: (N, 3) float32; exact unit gradient of the distance, d(sdf)/d(point).
+        frame: (N,) int32; the frame in which the point was first sampled.
+        surface_points_world: (M, 3) float32, metres; exact surface points that the sensor saw.
+    """
+
+    points_world: np.ndarray
+    sdf: np.ndarray
+    grad: np.ndarray
+    frame: np.ndarray
+    surface_points_world: np.ndarray
+
+
+def evaluate(
+    sdf_and_grad: Callable[[np.ndarray], tuple[Any, Any]],
+    truth: GroundTruth,
+    sensor_position_world: Any | None = None,
+    last_frame: int | None = None,
+) -> dict[str, float]:
+    """Scores a map against exact distances (section V-B of the paper, and collision recall).
+
+    A map that answers NaN gets NaN scores: nothing is left out of a mean. A score with nothing to
+    average (no true collision, say) is NaN too.
+
+    Args:
+        sdf_and_grad: Maps (n, 3) float32 points in the world, metres, to (n,) distances in metres
+            and (n, 3) gradients, as numpy or jax arrays. Always called with the same n.
+        truth: Exact distances; see `GroundTruth`.
+        sensor_position_world: (3,) metres; adds `within_3m_cm`, the paper's local SDF error.
+        last_frame: Only points first seen in frames <= last_frame count. Surface points carry no
+            frame, so `surface_cm` is NaN while later frames are left out.
+
+    Returns:
+        `visible_cm` mean absolute error; `near_cm` the same where the true distance is < 0.5 m;
+        `within_3m_cm` the same within 3 m of the sensor (only with `sensor_position_world`);
+        `bias_cm` mean of map - truth; `surface_cm` mean |sdf| on surface points; `eikonal` mean of
+        | |grad| - 1 |; `cosine` mean of 1 - cos(grad, true grad), 1 where a gradient is zero;
+        `recall` and `fpr` of "a sphere collides when the distance at its centre < its radius",
+        for spheres of 0.05 to 0.4 m radius (drawn from one fixed seed) centred on the points.
+
+    Raises:
+        ValueError: Truth is misshapen, no point has frame <= last_frame, the sensor position is not
+            (3,), or the map's answers have the wrong shape.
+    """
+    points, sdf_true, grad_true, frame, surface = (np.asarray(field) for field in truth)
+    count = len(points)
+    for name, array, shape in (
+        ("points_world", points, (count, 3)),
+        ("sdf", sdf_true, (count,)),
+        ("grad", grad_true, (count, 3)),
+        ("frame", frame, (count,)),
+        ("surface_points_world", surface, (len(surface), 3)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"truth.{name} has shape {array.shape}, expected {shape}")
+
+    # Drawn for all points before any are dropped, so that a point keeps its sphere.
+    radius = np.random.default_rng(1).uniform(*_RADIUS_BOUNDS, count)
+    selected = np.full(count, True) if last_frame is None else frame <= last_frame
+    if not selected.any():
+        raise ValueError(
+            f"last_frame = {last_frame} leaves none of the {count} points of truth; "
+            f"expected last_frame >= {frame.min() if count else 0} and a truth with points"
+        )
+    complete = bool(selected.all())
+    points, radius = points[selected], radius[selected]
+    sdf_true, grad_true = sdf_true[selected].astype(float), grad_true[selected].astype(float)
+
+    sdf_map, grad_map = _in_chunks(sdf_and_grad, points)
+    error = sdf_map - sdf_true
+    norm_map = np.linalg.norm(grad_map, axis=-1)
+    norm_product = norm_map * np.linalg.norm(grad_true, axis=-1)
+    cosine = np.sum(grad_map * grad_true, axis=-1) / np.where(norm_product == 0, 1, norm_product)
+    collides = sdf_true < radius
+    called = np.where(np.isnan(sdf_map), np.nan, sdf_map < radius)
+
+    scores = {
+        "visible_cm": 100 * _mean(np.abs(error)),
+        "near_cm": 100 * _mean(np.abs(error[sdf_true < _NEAR])),
+    }
+    if sensor_position_world is not None:
+        sensor = np.asarray(sensor_position_world, float)
+        if sensor.shape != (3,):
+            raise ValueError(f"sensor_position_world has shape {sensor.shape}, expected (3,)")
+        local = np.linalg.norm(points - sensor, axis=-1) < _LOCAL_RADIUS
+        scores["within_3m_cm"] = 100 * _mean(np.abs(error[local]))
+    surface_error = np.abs(_in_chunks(sdf_and_grad, surface)[0]) if complete else np.empty(0)
+    return scores | {
+        "bias_cm": 100 * _mean(error),
+        "surface_cm": 100 * _mean(surface_error),
+        "eikonal": _mean(np.abs(norm_map - 1)),
+        "cosine": _mean(1 - cosine),
+        "recall": _mean(called[collides]),
+        "fpr": _mean(called[~collides]),
+    }
+
+
+def held_out_surface(
+    sdf: Callable[[np.ndarray], Any], points_world: np.ndarray
+) -> dict[str, float]:
+    """Scores a map of a real stream on returns that it was not given.
+
+    The distance at a return is zero but for the sensor's noise, so that this needs no ground truth.
+
+    Args:
+        sdf: Maps (n, 3) float32 points in the world, metres, to (n,) distances in metres. Always
+            called with the same n.
+        points_world: (N, 3) metres, returns of frames that the map has not seen.
+
+    Returns:
+        `median_cm`, `mean_cm` and `p90_cm` (90th percentile) of |sdf| in centimetres.
+
+    Raises:
+        ValueError: points_world is not (N, 3) with N > 0, or the map's answers are misshapen.
+    """
+    points = np.asarray(points_world)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise ValueError(f"points_world has shape {points.shape}, expected (N, 3) with N > 0")
+    error_cm = 100 * np.abs(_in_chunks(lambda p: (sdf(p), p), points)[0])
+    return {
+        "median_cm": float(np.median(error_cm)),
+        "mean_cm": _mean(error_cm),
+        "p90_cm": float(np.percentile(error_cm, 90)),
+    }
+
+
+def format_table(
+    scores: Mapping[str, float], peers: Mapping[str, Mapping[str, Any]] | None = None
+) -> str:
+    """Lays scores out as a table for a terminal.
+
+    Args:
+        scores: What `evaluate` or `held_out_surface` returned.
+        peers: {name: {metric: value}}; a value may be a list (one a seed), of which the mean is
+            shown. Peers with none of these metrics are left out.
+
+    Returns:
+        The table, one metric a row with its unit and which direction is better, then ours, then the
+        peers. A dash stands for "no value".
+    """
+    rows = [key for key in _METRICS if key in scores]
+    columns: dict[str, Mapping[str, Any]] = {"ours": scores}
+    columns |= {name: peer for name, peer in (peers or {}).items() if any(r in peer for r in rows)}
+    cells = [["metric", "unit", "better", *columns]]
+    for key in rows:
+        decimals = 2 if key.endswith("_cm") else 3
+        values = [_cell(column.get(key), decimals) for column in columns.values()]
+        cells.append([*_METRICS[key], *values])
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if i < 3 else cell.rjust(width)  # text left, numbers right
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+def _in_chunks(
+    sdf_and_grad: Callable[[np.ndarray], tuple[Any, Any]], points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Queries in chunks of one shape; returns float64 (N,) and (N, 3)."""
+    sdf, grad = np.empty(len(points)), np.empty((len(points), 3))
+    for start in range(0, len(points), _CHUNK):
+        chunk = points[start : start + _CHUNK].astype(np.float32)
+        n = len(chunk)
+        # The last point repeated: a padding that every map can answer.
+        values, grads = sdf_and_grad(np.pad(chunk, ((0, _CHUNK - n), (0, 0)), mode="edge"))
+        for name, array, shape in (("sdf", values, (_CHUNK,)), ("grad", grads, (_CHUNK, 3))):
+            if np.shape(array) != shape:
+                raise ValueError(
+                    f"the map answered {name} of shape {np.shape(array)} for {_CHUNK} points, "
+                    f"expected {shape}"
+                )
+        sdf[start : start + n] = np.asarray(values)[:n]
+        grad[start : start + n] = np.asarray(grads)[:n]
+    return sdf, grad
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _cell(value: Any, decimals: int) -> str:
+    if value is None or not np.isfinite(np.mean(value)):
+        return "-"
+    return f"{np.mean(value):.{decimals}f}"

@@ -1,0 +1,200 @@
+"""The distance transform: every voxel's nearest surface patch, and its side of it.
+
+Three separable passes, one an axis, each the exact minimum over all sites within the horizon of a
+squared distance; the sites lie at their patch's centre, not at their voxel's.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax.config import Config
+from hiosdf_jax.grid import geometry, surface
+from hiosdf_jax.state import Grid
+
+NO_FEATURE = -128
+"""`Grid.nearest` where there is no feature within the horizon."""
+
+_INFINITE = 1e12  # squared voxels
+
+# A voxel is free if at least this many rays went through it for each that ended just before it:
+# noise puts some ends of rays too far.
+_FREE_RATIO = 0.1
+
+# How far behind a patch free space makes it a sheet: beyond the margin that passes keep, voxels.
+_SHEET_VOXELS = 2.0
+
+# Shifts that one loop iteration of a pass tries in either direction.
+_CHUNK = 8
+
+
+def nearest_sites(sites: jax.Array, offset: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
+    """Finds each voxel's nearest site by exact passes over the axes.
+
+    Args:
+        sites: (X, Y, Z) bool, the voxels that hold a site.
+        offset: (X, Y, Z, 3) of the site from its voxel's centre, voxels, in [-0.5, 0.5].
+        horizon: Sites farther than this along an axis are not looked for, voxels.
+
+    Returns:
+        nearest: (X, Y, Z) int32, the flat index of the nearest site's voxel; -1 where none is
+            within the horizon.
+        squared: (X, Y, Z) squared distance of the voxel's centre to it, voxels^2.
+    """
+    shape = sites.shape
+    nearest = jnp.arange(sites.size, dtype=jnp.int32).reshape(shape)
+    position = nearest
+    squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
+    flat_offset = offset.reshape(-1, 3)
+    # Short axes first: after a floor and a ceiling are known, the others need few shifts.
+    for axis in sorted(range(3), key=lambda k: shape[k]):
+        stride = [shape[1] * shape[2], shape[2], 1][axis]
+        along = flat_offset[nearest.ravel(), axis].reshape(shape)
+        squared, shift = _pass(squared, along, axis, horizon)
+        nearest = nearest.ravel()[(position + shift * stride).ravel()].reshape(shape)
+    found = squared <= horizon**2
+    return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
+
+
+def _pass(
+    squared: jax.Array, along: jax.Array, axis: int, horizon: int
+) -> tuple[jax.Array, jax.Array]:
+    """Least distance over shifts of the candidates along an axis.
+
+    The candidate of a voxel k further on is at k + along from here, and its distance across the
+    axis is the same as there.
+    """
+    length = squared.shape[axis]
+    reach = min(horizon + 1, length - 1)
+    chunks = -(-reach // _CHUNK)
+    margin = [(0, 0)] * 3
+    margin[axis] = (chunks * _CHUNK, chunks * _CHUNK)
+    across = jnp.pad(squared - along * along, margin, constant_values=_INFINITE)
+    along = jnp.pad(along, margin)
+
+    def better(best: jax.Array, shift: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        start = chunks * _CHUNK + k
+        there = jax.lax.dynamic_slice_in_dim(along, start, length, axis)
+        candidate = jax.lax.dynamic_slice_in_dim(across, start, length, axis) + (k + there) ** 2
+        return jnp.minimum(best, candidate), jnp.where(candidate < best, k, shift)
+
+    def more(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        chunk, best, _ = carry
+        # A site k voxels on is at least k - 1/2 away.
+        least = (chunk * _CHUNK + 0.5) ** 2
+        return (chunk < chunks) & (least < jnp.max(jnp.minimum(best, horizon**2)))
+
+    def step(
+        carry: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        chunk, best, shift = carry
+        for k in range(1, _CHUNK + 1):
+            for sign in (-1, 1):
+                best, shift = better(best, shift, sign * (chunk * _CHUNK + k))
+        return chunk + 1, best, shift
+
+    start = (jnp.int32(0), squared, jnp.zeros(squared.shape, jnp.int32))
+    _, best, shift = jax.lax.while_loop(more, step, start)
+    return best, shift
+
+
+def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid:
+    """Recomputes distances and signs where evidence near a sensor can have changed them.
+
+    A voxel changes only within max_range + horizon of the sensor, and the features that decide on
+    it lie within the horizon of it: the window read is that much larger than the part written.
+
+    Args:
+        config: The map's configuration.
+        grid: The grid, with new evidence within max_range of the sensor.
+        sensor_world: (3,) m.
+
+    Returns:
+        The grid with nearest and sdf as if recomputed everywhere.
+    """
+    horizon_m = config.horizon_voxels * config.voxel_size
+    changed = config.max_range + horizon_m + config.voxel_size
+    shape = geometry.window_shape(config, changed + horizon_m)
+    start = geometry.window_start(config, shape, sensor_world)
+    hits, passes, behind, mean, axes = (
+        geometry.read_window(array, start, shape)
+        for array in (grid.hits, grid.passes, grid.behind, grid.mean, grid.axes)
+    )
+    mean = mean.astype(jnp.float32)
+    features = surface.is_feature(config, hits, passes)
+    nearest, _ = nearest_sites(features, mean, config.horizon_voxels)
+    found = nearest >= 0
+
+    here = jnp.stack(jnp.meshgrid(*(jnp.arange(n) for n in shape), indexing="ij"), axis=-1)
+    site = jnp.stack(jnp.unravel_index(jnp.maximum(nearest, 0), shape), axis=-1)
+    jump = site - here
+    row = jnp.maximum(nearest, 0).ravel()
+    patch_mean = mean.reshape(-1, 3)[row].reshape(*shape, 3) + jump
+    patch_axes = axes.reshape(-1, 3, 3)[row].reshape(*shape, 3, 3).astype(jnp.float32)
+    offset = surface.patch_offset(jnp.zeros(3), patch_mean, patch_axes)
+    distance = surface.safe_norm(offset)
+    side = _side(passes, behind, here, offset, distance, patch_axes)
+    sdf = jnp.where(found, side * distance * config.voxel_size, config.distance_horizon)
+    jump = jnp.where(found[..., None], jump, NO_FEATURE).astype(jnp.int8)
+
+    inner = geometry.window_shape(config, changed)
+    inner_start = geometry.window_start(config, inner, sensor_world)
+    within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
+    return grid.replace(
+        nearest=geometry.write_window(
+            grid.nearest, inner_start, geometry.read_window(jump, within, inner)
+        ),
+        sdf=geometry.write_window(grid.sdf, inner_start, geometry.read_window(sdf, within, inner)),
+    )
+
+
+def is_free(passes: jax.Array, behind: jax.Array) -> jax.Array:
+    """Tells the voxels that rays have shown to be free: a ray went through, and not by chance.
+
+    Args:
+        passes: (...) rays that went through the voxel.
+        behind: (...) rays that ended a little before it.
+
+    Returns:
+        (...) bool.
+    """
+    return (passes > 0) & (passes >= _FREE_RATIO * behind)
+
+
+def _side(
+    passes: jax.Array,
+    behind: jax.Array,
+    here: jax.Array,
+    offset: jax.Array,
+    distance: jax.Array,
+    axes: jax.Array,
+) -> jax.Array:
+    """Sign of each voxel's centre: +1 in free space, -1 behind surfaces.
+
+    Away from surfaces the rays through the voxel decide. Within a voxel of a flat patch the side
+    of its plane does, since rays end in such a voxel: unless the patch is a sheet, with free space
+    behind it as well.
+
+    Args:
+        passes: (X, Y, Z) rays that went through the voxel.
+        behind: (X, Y, Z) rays that ended a little before it.
+        here: (X, Y, Z, 3) index of the voxel in these arrays.
+        offset: (X, Y, Z, 3) from the nearest point of the nearest patch to the centre, voxels.
+        distance: (X, Y, Z) its length.
+        axes: (X, Y, Z, 3, 3) of that patch.
+
+    Returns:
+        (X, Y, Z) float32.
+    """
+    free = is_free(passes, behind)
+    length = surface.safe_norm(axes)
+    flat = length[..., 2] < 0.5 * length[..., 1]
+    normal = axes[..., 2, :] / jnp.maximum(length[..., 2], 1e-6)[..., None]
+    in_front = jnp.sum(offset * normal, axis=-1) >= 0
+    probe = jnp.round(here - offset - _SHEET_VOXELS * normal).astype(jnp.int32)
+    probe = jnp.clip(probe, 0, jnp.asarray(free.shape) - 1)
+    sheet = free.ravel()[geometry.flat_index(free.shape, probe)]
+    by_plane = in_front | sheet
+    by_rays = free | ((behind == 0) & in_front)
+    return jnp.where(jnp.where(flat & (distance < 1), by_plane, by_rays), 1.0, -1.0)

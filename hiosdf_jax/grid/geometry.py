@@ -1,0 +1,138 @@
+"""Voxels and metres: the lattice, windows of the grid, the eight voxels around a point.
+
+Voxel i of the lattice covers [i, i + 1) * voxel_size along an axis of the world frame; the grid
+holds the lattice's voxels from `config.corner_index` on. Which voxel a point falls in does
+therefore not depend on the bounds, and a grown map answers bit by bit as before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax.config import Config
+
+
+def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds the voxels that contain points.
+
+    Args:
+        config: The map's configuration.
+        points_world: (..., 3) m.
+
+    Returns:
+        index: (..., 3) int32 into the grid; the nearest voxel for points outside.
+        offset: (..., 3) from the voxel's centre, voxels, in [-0.5, 0.5) for points inside.
+        inside: (...) bool; False for a point with a NaN.
+    """
+    lattice = points_world / config.voxel_size
+    corner = jnp.asarray(config.corner_index, lattice.dtype)
+    shape = jnp.asarray(config.grid_shape, lattice.dtype)
+    # Compared as floats: a far point would overflow an int32.
+    cell = jnp.floor(lattice) - corner
+    inside = jnp.all((cell >= 0) & (cell < shape), axis=-1)
+    cell = jnp.clip(cell, 0, shape - 1)
+    offset = lattice - (cell + corner) - 0.5
+    return jnp.nan_to_num(cell).astype(jnp.int32), offset, inside
+
+
+def voxel_center(config: Config, index: jax.Array) -> jax.Array:
+    """Finds the centres of voxels.
+
+    Args:
+        config: The map's configuration.
+        index: (..., 3) int32 into the grid.
+
+    Returns:
+        (..., 3) m, world frame.
+    """
+    lattice = index + jnp.asarray(config.corner_index, jnp.int32)
+    return (lattice.astype(jnp.float32) + 0.5) * config.voxel_size
+
+
+def flat_index(shape: tuple[int, int, int], index: jax.Array) -> jax.Array:
+    """Turns (..., 3) indices of an array of this shape into (...) indices of its raveled form."""
+    return (index[..., 0] * shape[1] + index[..., 1]) * shape[2] + index[..., 2]
+
+
+class Corners(NamedTuple):
+    """The eight voxels around points, with the weights of trilinear interpolation.
+
+    Attributes:
+        index: (..., 8, 3) int32 into the grid.
+        weight: (..., 8), adding up to 1.
+    """
+
+    index: jax.Array
+    weight: jax.Array
+
+
+_CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
+
+
+def corners_of(config: Config, points_world: jax.Array) -> Corners:
+    """Finds the eight voxels whose centres surround points; at the border, the nearest ones.
+
+    Args:
+        config: The map's configuration.
+        points_world: (..., 3) m, finite, inside the bounds.
+
+    Returns:
+        The corners.
+    """
+    lattice = points_world / config.voxel_size - 0.5
+    base = jnp.floor(lattice)
+    fraction = (lattice - base)[..., None, :]
+    corner = jnp.asarray(config.corner_index, jnp.int32)
+    index = (base.astype(jnp.int32) - corner)[..., None, :] + _CORNERS
+    weight = jnp.prod(jnp.where(_CORNERS == 1, fraction, 1 - fraction), axis=-1)
+    return Corners(jnp.clip(index, 0, jnp.asarray(config.grid_shape) - 1), weight)
+
+
+def clamp(config: Config, points_world: jax.Array) -> jax.Array:
+    """Moves (..., 3) points outside the bounds, m, to the nearest point of the box."""
+    low, high = jnp.asarray(config.bounds, points_world.dtype)
+    return jnp.clip(points_world, low, high)
+
+
+def window_shape(config: Config, reach: float) -> tuple[int, int, int]:
+    """Shape of the part of the grid within `reach` metres of a point, along the axes."""
+    span = 2 * math.ceil(reach / config.voxel_size) + 1
+    x, y, z = config.grid_shape
+    return (min(x, span), min(y, span), min(z, span))
+
+
+def window_start(
+    config: Config, shape: tuple[int, int, int], center_world: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """First voxel of the window of this shape around a point, moved to lie inside the grid.
+
+    Args:
+        config: The map's configuration.
+        shape: Of the window, no larger than the grid.
+        center_world: (3,) m.
+
+    Returns:
+        Three int32 scalars.
+    """
+    index, _, _ = voxel_of(config, center_world)
+    room = jnp.asarray(config.grid_shape, jnp.int32) - jnp.asarray(shape, jnp.int32)
+    start = jnp.clip(index - jnp.asarray(shape, jnp.int32) // 2, 0, room)
+    return start[0], start[1], start[2]
+
+
+def read_window(
+    array: jax.Array, start: tuple[jax.Array, ...], shape: tuple[int, int, int]
+) -> jax.Array:
+    """Cuts the window out of a grid array; axes after the third come along whole."""
+    rest = array.shape[3:]
+    return jax.lax.dynamic_slice(array, (*start, *(0 for _ in rest)), (*shape, *rest))
+
+
+def write_window(array: jax.Array, start: tuple[jax.Array, ...], values: jax.Array) -> jax.Array:
+    """Puts a window's values back into a grid array."""
+    return jax.lax.dynamic_update_slice(array, values, (*start, *(0 for _ in array.shape[3:])))

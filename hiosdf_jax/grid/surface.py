@@ -1,0 +1,191 @@
+"""Hits become sub-voxel surface patches: running weighted mean and principal axes per voxel.
+
+The spread of the hits in a voxel tells what lies in it: a disc-like one is a piece of a wall, a
+rod-like one a table leg, a ball a corner. Its principal axes are kept instead of a covariance
+matrix: they are what a query needs, and the matrix follows from them.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax.config import Config
+from hiosdf_jax.grid import geometry
+from hiosdf_jax.state import Grid
+
+# The half extent of a patch along a principal axis, in standard deviations: sqrt(3) for hits that
+# are uniform along it, and a little less since noise widens the spread. Measured: 0.60 cm instead
+# of 0.62 cm on a depth stream, 0.71 instead of 0.73 on a LiDAR stream.
+_EXTENT_DEVIATIONS = 0.9 * 3**0.5
+
+# Axes shorter than this (voxels) are stored with it, so that a perfect plane keeps its normal.
+_LEAST_DEVIATION = 1e-3
+
+_JACOBI_SWEEPS = 5
+
+
+def fuse_hits(
+    config: Config,
+    grid: Grid,
+    points_world: jax.Array,
+    valid: jax.Array,
+    sensor_world: jax.Array,
+) -> Grid:
+    """Merges the ends of rays into the surface statistics of their voxels.
+
+    Args:
+        config: The map's configuration.
+        grid: The grid.
+        points_world: (N, 3) m.
+        valid: (N,) bool; other rows change nothing.
+        sensor_world: (3,) m.
+
+    Returns:
+        The grid with new hits, weight, mean and axes.
+    """
+    count = points_world.shape[0]
+    shape = config.grid_shape
+    voxels = shape[0] * shape[1] * shape[2]
+    index, offset, inside = geometry.voxel_of(config, points_world)
+    voxel = jnp.where(valid & inside, geometry.flat_index(shape, index), voxels)
+
+    # Rows of one voxel become neighbours, so that sums cost the cloud's size, not the grid's.
+    order = jnp.argsort(voxel)
+    voxel, offset = voxel[order], offset[order]
+    first = jnp.concatenate([jnp.ones(1, bool), voxel[1:] != voxel[:-1]])
+    group = jnp.cumsum(first) - 1
+    target = jnp.full(count, voxels, voxel.dtype).at[group].set(voxel)
+    used = (voxel < voxels).astype(jnp.float32)
+
+    ranges = safe_norm(points_world[order] - sensor_world)
+    noise_floor, noise_growth = config.range_noise
+    weight = used / (1 + noise_growth / noise_floor * ranges**2) ** 2
+    offset = jnp.where(used[:, None] > 0, offset, 0)
+
+    def total(values: jax.Array) -> jax.Array:
+        return jax.ops.segment_sum(values, group, count, indices_are_sorted=True)
+
+    new_hits, new_weight = total(used), total(weight)
+    share = 1 / jnp.maximum(new_weight, 1e-30)
+    new_mean = total(weight[:, None] * offset) * share[:, None]
+    centered = offset - new_mean[group]
+    products = centered[:, :, None] * centered[:, None, :]
+    new_spread = total(weight[:, None, None] * products) * share[:, None, None]
+
+    # Chan's rule merges the two means and covariances.
+    old_hits, old_weight, old_mean, old_axes = (
+        array.reshape(voxels, *array.shape[3:])[jnp.minimum(target, voxels - 1)].astype(jnp.float32)
+        for array in (grid.hits, grid.weight, grid.mean, grid.axes)
+    )
+    old_spread = jnp.einsum("nki,nkj->nij", old_axes, old_axes)
+    part = new_weight / jnp.maximum(old_weight + new_weight, 1e-30)
+    step = new_mean - old_mean
+    mean = old_mean + part[:, None] * step
+    spread = (
+        (1 - part)[:, None, None] * old_spread
+        + part[:, None, None] * new_spread
+        + (part * (1 - part))[:, None, None] * step[:, :, None] * step[:, None, :]
+    )
+    deviation, direction = principal_axes(spread)
+    target_index = jnp.stack(jnp.unravel_index(jnp.minimum(target, voxels - 1), shape), axis=-1)
+    center_world = geometry.voxel_center(config, target_index)
+    to_sensor = (sensor_world - center_world) / config.voxel_size - mean
+    faces_away = jnp.sum(direction[:, 2] * to_sensor, axis=-1) < 0
+    direction = direction.at[:, 2].multiply(jnp.where(faces_away, -1.0, 1.0)[:, None])
+    axes = jnp.maximum(deviation, _LEAST_DEVIATION)[:, :, None] * direction
+
+    def put(array: jax.Array, values: jax.Array) -> jax.Array:
+        flat = array.reshape(voxels, *array.shape[3:])
+        return flat.at[target].set(values.astype(array.dtype), mode="drop").reshape(array.shape)
+
+    return grid.replace(
+        hits=put(grid.hits, old_hits + new_hits),
+        weight=put(grid.weight, old_weight + new_weight),
+        mean=put(grid.mean, mean),
+        axes=put(grid.axes, axes),
+    )
+
+
+def is_feature(config: Config, hits: jax.Array, passes: jax.Array) -> jax.Array:
+    """Tells the voxels whose patch counts as surface: hit often enough, and seldom seen through.
+
+    Args:
+        config: The map's configuration.
+        hits: (...) rays that ended in the voxel.
+        passes: (...) rays that went through it.
+
+    Returns:
+        (...) bool.
+    """
+    return (hits >= config.min_hits) & (hits >= config.min_hit_ratio * (hits + passes))
+
+
+def patch_offset(point: jax.Array, mean: jax.Array, axes: jax.Array) -> jax.Array:
+    """Vector from the nearest point of a patch to a point.
+
+    A patch is the rectangle around `mean` that the two longest principal axes span; rods and
+    single hits are the cases in which one or both of them are short.
+
+    Args:
+        point: (..., 3), voxels.
+        mean: (..., 3) centre of the patch, same frame and unit.
+        axes: (..., 3, 3) principal axes as in `Grid.axes`, voxels.
+
+    Returns:
+        (..., 3) voxels; its length is the distance.
+    """
+    offset = point - mean
+    for k in range(2):
+        half = _EXTENT_DEVIATIONS * axes[..., k, :]
+        square = jnp.maximum(jnp.sum(half * half, axis=-1), 1e-12)
+        along = jnp.clip(jnp.sum(offset * half, axis=-1) / square, -1, 1)
+        offset = offset - along[..., None] * half
+    return offset
+
+
+def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eigen-decomposition of symmetric 3x3 matrices by Jacobi rotations, in the batch's lanes.
+
+    (LAPACK and cuSOLVER take the matrices one by one: 160 ms for 40,000 of them on two cores,
+    where this takes 10.)
+
+    Args:
+        spread: (..., 3, 3) symmetric, positive semi-definite.
+
+    Returns:
+        deviation: (..., 3) square roots of the eigenvalues, descending.
+        direction: (..., 3, 3) unit eigenvectors as rows, in the same order.
+    """
+    a = {(i, j): spread[..., i, j] for i in range(3) for j in range(i, 3)}
+    one, zero = jnp.ones_like(spread[..., 0, 0]), jnp.zeros_like(spread[..., 0, 0])
+    v = [[one if i == j else zero for j in range(3)] for i in range(3)]  # v[k]: k-th eigenvector
+    for _ in range(_JACOBI_SWEEPS):
+        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            off = a[p, q]
+            gap = a[q, q] - a[p, p]
+            # t = tan of the angle that makes a[p, q] zero, the smaller of the two.
+            safe = jnp.where(off == 0, one, off)
+            theta = jnp.clip(0.5 * gap / safe, -1e15, 1e15)
+            sign = jnp.where(theta < 0, -one, one)
+            t = jnp.where(off == 0, zero, sign / (jnp.abs(theta) + jnp.sqrt(theta * theta + 1)))
+            c = 1 / jnp.sqrt(t * t + 1)
+            s = t * c
+            pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
+            a[pr], a[qr] = c * a[pr] - s * a[qr], s * a[pr] + c * a[qr]
+            a[p, p], a[q, q] = a[p, p] - t * off, a[q, q] + t * off
+            a[p, q] = zero
+            for k in range(3):
+                v[p][k], v[q][k] = c * v[p][k] - s * v[q][k], s * v[p][k] + c * v[q][k]
+    value = jnp.stack([a[0, 0], a[1, 1], a[2, 2]], axis=-1)
+    vector = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
+    order = jnp.argsort(-value, axis=-1)
+    deviation = jnp.sqrt(jnp.maximum(jnp.take_along_axis(value, order, axis=-1), 0))
+    return deviation, jnp.take_along_axis(vector, order[..., None], axis=-2)
+
+
+def safe_norm(vectors: jax.Array) -> jax.Array:
+    """Length of (..., 3) vectors, with gradient 0 instead of NaN at 0."""
+    square = jnp.sum(vectors * vectors, axis=-1)
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)

@@ -1,0 +1,78 @@
+"""The local SDF (paper, section IV-C): samples on the newest rays, measured against the cloud."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax.config import Config
+from hiosdf_jax.grid.surface import safe_norm
+from hiosdf_jax.samples import Samples, draw_from_mask
+
+# Pairs of query and cloud point that are looked at together: bounds the memory.
+_TILE_PAIRS = 1 << 24
+
+
+def sample_local(
+    config: Config,
+    points_world: jax.Array,
+    valid: jax.Array,
+    sensor_world: jax.Array,
+    key: jax.Array,
+) -> Samples:
+    """Draws stratified samples on rays of the newest cloud, with their distance to it.
+
+    The sign is + before the end of the ray and - behind it (equation 1), the magnitude the
+    distance to the nearest point of the whole cloud (equation 2).
+
+    Args:
+        config: The map's configuration.
+        points_world: (N, 3) m, the cloud.
+        valid: (N,) bool; other rows are not there.
+        sensor_world: (3,) m.
+        key: Source of randomness.
+
+    Returns:
+        local_points * local_ray_samples samples; those at local_truncation or more from the cloud
+        are without weight.
+    """
+    choice_key, depth_key = jax.random.split(key)
+    ranges = safe_norm(points_world - sensor_world)
+    eligible = valid & (ranges < config.local_max_range)
+    chosen, possible = draw_from_mask(eligible, config.local_points, choice_key)
+    ends, end_ranges = points_world[chosen], ranges[chosen]
+    directions = (ends - sensor_world) / jnp.maximum(end_ranges, 1e-6)[:, None]
+
+    shape = (config.local_points, config.local_ray_samples)
+    strata = (jnp.arange(shape[1]) + jax.random.uniform(depth_key, shape)) / shape[1]
+    depths = strata * (end_ranges[:, None] + config.local_truncation)
+    queries_world = sensor_world + depths[..., None] * directions[:, None, :]
+    queries_world = queries_world.reshape(-1, 3)
+
+    distance = nearest_distance(queries_world, points_world, valid)
+    sign = jnp.where(depths < end_ranges[:, None], 1.0, -1.0).ravel()
+    kept = possible & (distance < config.local_truncation)
+    return Samples(queries_world, sign * distance, kept.astype(jnp.float32))
+
+
+def nearest_distance(queries: jax.Array, points: jax.Array, valid: jax.Array) -> jax.Array:
+    """Distance to the nearest point of a cloud, by comparing with all of them.
+
+    Args:
+        queries: (Q, 3) m.
+        points: (N, 3) m.
+        valid: (N,) bool; other points are not there.
+
+    Returns:
+        (Q,) m; inf if no point is valid.
+    """
+    # Out of reach, but not inf: inf - inf would be NaN.
+    points = jnp.where(valid[:, None], points, 1e15)
+
+    def nearest(query: jax.Array) -> jax.Array:
+        square = sum((points[:, k] - query[k]) ** 2 for k in range(3))
+        return jnp.min(square)
+
+    tile = max(1, _TILE_PAIRS // points.shape[0])
+    square = jax.lax.map(nearest, queries, batch_size=min(tile, queries.shape[0]))
+    return jnp.where(square < 1e29, jnp.sqrt(square), jnp.inf)

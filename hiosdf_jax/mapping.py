@@ -1,0 +1,256 @@
+"""The map's life: `init`, `update`, `snapshot`, `grow`. The one place where the stages meet."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax.config import Config
+from hiosdf_jax.grid import distance, geometry, lookup, rays, sampling, surface
+from hiosdf_jax.local import sample_local
+from hiosdf_jax.network import training
+from hiosdf_jax.samples import concatenate
+from hiosdf_jax.state import Field, Flag, Grid, MapState, Report
+
+# How far R^T R may be from the identity: real trajectories are written with few digits.
+_RIGID_TOLERANCE = 5e-3
+
+
+def init(config: Config, key: jax.Array) -> MapState:
+    """Makes an empty map.
+
+    Args:
+        config: The map's configuration.
+        key: Source of all the map's randomness, from `jax.random.key` (or `PRNGKey`).
+
+    Returns:
+        The map; its distances are those of an untrained network.
+
+    Raises:
+        ValueError: An argument is not what it should be.
+    """
+    if not isinstance(config, Config):
+        raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
+    key = _typed_key(key)
+    key, network_key = jax.random.split(key)
+    zero = jnp.zeros((), jnp.int32)
+    return MapState(
+        config=config,
+        grid=_empty_grid(config),
+        network=training.init_network(config, network_key),
+        key=key,
+        updates=zero,
+        report=Report(
+            points_used=zero,
+            points_outside=zero,
+            points_out_of_range=zero,
+            points_invalid=zero,
+            sdf_loss=jnp.zeros(()),
+            eikonal_loss=jnp.zeros(()),
+            flags=jnp.zeros((), jnp.uint32),
+        ),
+    )
+
+
+def update(state: MapState, cloud: Any, pose: Any) -> MapState:
+    """Fuses one posed point cloud into the map.
+
+    Pure: the given state stays valid. Called with concrete arrays it checks them, pads or draws
+    the cloud to `config.max_points` rows and runs one compiled function; called inside `jit`,
+    `lax.scan` or `vmap` it takes the shapes as they are and reports by `state.report.flags`.
+
+    Args:
+        state: The map so far.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        pose: (4, 4) T_world_sensor, rigid.
+
+    Returns:
+        The new map.
+
+    Raises:
+        ValueError: A shape is wrong; outside jit also: the pose is not finite or not rigid, or
+            the cloud has no finite row.
+    """
+    if not isinstance(state, MapState):
+        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    _check_shapes(cloud, pose)
+    leaves = (*jax.tree.leaves(state), cloud, pose)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return _update(state, jnp.asarray(cloud), jnp.asarray(pose))
+    cloud, pose = np.asarray(cloud, np.float32), np.asarray(pose, np.float32)
+    _check_values(cloud, pose)
+    return _update_jit(state, _to_capacity(cloud, pose, state.config.max_points), pose)
+
+
+def snapshot(state: MapState) -> Field:
+    """Copies what queries need, so that a planner can hold it while the map goes on.
+
+    Args:
+        state: The map.
+
+    Returns:
+        A field that shares no memory with the map.
+    """
+    return Field(
+        config=state.config,
+        params=jax.tree.map(jnp.copy, state.network.served),
+        origin_world=jnp.copy(state.network.origin_world),
+        observed=lookup.observed(state.grid),
+        updates=jnp.copy(state.updates),
+    )
+
+
+def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
+    cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
+    finite = jnp.all(jnp.isfinite(cloud), axis=-1)
+    rigid = _is_rigid(pose)
+    usable = rigid & jnp.any(finite)
+    flags = (
+        state.report.flags
+        | jnp.where(rigid, 0, Flag.BAD_POSE).astype(jnp.uint32)
+        | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD).astype(jnp.uint32)
+    )
+    state = state.replace(report=state.report.replace(flags=flags))
+    return jax.lax.cond(usable, _integrate, lambda state, *_: state, state, cloud, finite, pose)
+
+
+_update_jit = jax.jit(_update)
+
+
+def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> MapState:
+    config = state.config
+    key, grid_key, local_key, order_key = jax.random.split(state.key, 4)
+
+    # The cloud in the world.
+    cloud = jnp.where(finite[:, None], cloud, 0)
+    ranges = surface.safe_norm(cloud)
+    in_range = finite & (ranges >= config.min_range)
+    ends = in_range & (ranges <= config.max_range)
+    sensor_world = pose[:3, 3]
+    offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
+    points_world = sensor_world + offsets_world
+    directions_world = offsets_world / jnp.maximum(ranges, 1e-6)[:, None]
+    _, _, inside = geometry.voxel_of(config, points_world)
+
+    # The coarse grid (paper, IV-B).
+    grid = surface.fuse_hits(config, state.grid, points_world, ends, sensor_world)
+    grid = rays.trace_rays(
+        config,
+        grid,
+        directions_world,
+        jnp.minimum(ranges, config.max_range),
+        in_range,
+        ends,
+        sensor_world,
+    )
+    grid = rays.fade_evidence(config, grid, sensor_world)
+    grid = distance.update_distances(config, grid, sensor_world)
+
+    # What the network learns from (IV-B, IV-C), and its fit (IV-D).
+    samples = concatenate(
+        sampling.sample_grid(config, grid, grid_key),
+        sample_local(config, points_world, ends, sensor_world, local_key),
+    )
+    epochs = jnp.where(state.updates < config.warmup_updates, config.warmup_epochs, config.epochs)
+    # A running mean over the first updates, so that the untrained network is never served.
+    average = jnp.minimum(config.weight_average, state.updates / (state.updates + 1.0))
+    network, parts, trained = training.train(
+        config, state.network, samples, epochs, average, order_key
+    )
+
+    outside = ends & ~inside
+    flags = (
+        state.report.flags
+        | jnp.where(jnp.any(outside), Flag.POINTS_OUTSIDE, 0).astype(jnp.uint32)
+        | jnp.where(trained, 0, Flag.TRAINING_FAILED).astype(jnp.uint32)
+    )
+
+    def count(rows: jax.Array) -> jax.Array:
+        return jnp.sum(rows, dtype=jnp.int32)
+
+    return state.replace(
+        grid=grid,
+        network=network,
+        key=key,
+        updates=state.updates + 1,
+        report=Report(
+            points_used=count(ends & inside),
+            points_outside=count(outside),
+            points_out_of_range=count(finite & ~ends),
+            points_invalid=count(~finite),
+            sdf_loss=parts.sdf,
+            eikonal_loss=parts.eikonal,
+            flags=flags,
+        ),
+    )
+
+
+def _empty_grid(config: Config) -> Grid:
+    shape = config.grid_shape
+    return Grid(
+        hits=jnp.zeros(shape),
+        passes=jnp.zeros(shape),
+        behind=jnp.zeros(shape),
+        weight=jnp.zeros(shape),
+        mean=jnp.zeros((*shape, 3), jnp.float16),
+        axes=jnp.zeros((*shape, 3, 3), jnp.float16),
+        nearest=jnp.full((*shape, 3), distance.NO_FEATURE, jnp.int8),
+        sdf=jnp.full(shape, config.distance_horizon),
+    )
+
+
+def _is_rigid(pose: jax.Array) -> jax.Array:
+    rotation = pose[:3, :3]
+    # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
+    gram = jnp.sum(rotation[:, :, None] * rotation[:, None, :], axis=0)
+    handed = jnp.dot(jnp.cross(rotation[0], rotation[1]), rotation[2], precision="highest")
+    orthonormal = jnp.all(jnp.abs(gram - jnp.eye(3)) <= _RIGID_TOLERANCE)
+    last_row = jnp.all(jnp.abs(pose[3] - jnp.array([0.0, 0, 0, 1])) <= 1e-6)
+    return orthonormal & last_row & (handed > 0) & jnp.all(jnp.isfinite(pose))
+
+
+def _check_shapes(cloud: Any, pose: Any) -> None:
+    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
+        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
+    if np.shape(pose) != (4, 4):
+        raise ValueError(f"pose has shape {np.shape(pose)}, expected (4, 4)")
+
+
+def _check_values(cloud: np.ndarray, pose: np.ndarray) -> None:
+    if not np.isfinite(pose).all():
+        raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
+    if not bool(_is_rigid(jnp.asarray(pose))):
+        raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
+    if not np.isfinite(cloud).all(axis=1).any():
+        raise ValueError(
+            f"cloud has no finite row among its {len(cloud)}, expected at least one return"
+        )
+
+
+def _to_capacity(cloud: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
+    """Pads a cloud with NaN rows, or draws from its finite rows, to (capacity, 3)."""
+    if len(cloud) > capacity:
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    if len(cloud) > capacity:
+        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
+        seed = zlib.crc32(pose.tobytes(), len(cloud))
+        rows = np.random.default_rng(seed).choice(len(cloud), capacity, replace=False)
+        cloud = cloud[np.sort(rows)]
+    padded = np.full((capacity, 3), np.nan, np.float32)
+    padded[: len(cloud)] = cloud
+    return padded
+
+
+def _typed_key(key: Any) -> jax.Array:
+    array = jnp.asarray(key) if not isinstance(key, jax.Array) else key
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) and array.shape == ():
+        return array
+    if array.dtype == jnp.uint32 and array.shape == (2,):
+        return jax.random.wrap_key_data(array)
+    raise ValueError(
+        f"key has dtype {array.dtype} and shape {array.shape}, expected one jax.random.key"
+    )

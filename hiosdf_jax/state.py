@@ -1,0 +1,149 @@
+"""The pytrees of a map: what `update` carries from cloud to cloud, and what a planner holds."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+
+from hiosdf_jax.config import Config
+
+
+class Flag(enum.IntFlag):
+    """What has gone wrong since the map was made; bits of `Report.flags`, never cleared."""
+
+    BAD_POSE = 1
+    """A pose was not finite or not rigid: that update changed nothing else."""
+    EMPTY_CLOUD = 2
+    """A cloud had no finite row: that update changed nothing else."""
+    POINTS_OUTSIDE = 4
+    """Points in range fell outside the bounds: they cleared their rays but left no surface."""
+    TRAINING_FAILED = 8
+    """A training step gave a value that is not finite: the network was kept as it was."""
+
+
+@flax.struct.dataclass
+class Report:
+    """Scalars of the last update; `flags` gathers those of all updates.
+
+    Attributes:
+        points_used: Points that were fused into the grid, int32.
+        points_outside: Points in range whose end lies outside the bounds, int32.
+        points_out_of_range: Finite points nearer than min_range or farther than max_range, int32.
+        points_invalid: Rows with a NaN or inf, padding included, int32.
+        sdf_loss: Mean |f - s| over the samples in the last epoch, m, float32 (paper, eq. 4).
+        eikonal_loss: Mean | |grad f| - 1 | in the last epoch, float32 (paper, eq. 5).
+        flags: Bits of `Flag`, uint32, sticky.
+    """
+
+    points_used: jax.Array
+    points_outside: jax.Array
+    points_out_of_range: jax.Array
+    points_invalid: jax.Array
+    sdf_loss: jax.Array
+    eikonal_loss: jax.Array
+    flags: jax.Array
+
+
+@flax.struct.dataclass
+class Grid:
+    """The coarse global grid: what each voxel remembers of the rays that met it.
+
+    Lengths are in voxels; offsets are from the voxel's centre. The first six arrays are evidence,
+    the last two are derived from it by `distance.update_distances`.
+
+    Attributes:
+        hits: Rays that ended in the voxel (fading), (X, Y, Z) float32.
+        passes: Rays that went through it well before their end (fading), (X, Y, Z) float32.
+        behind: Rays that ended a little before it (fading), (X, Y, Z) float32.
+        weight: Sum of the weights of the hits (fading), (X, Y, Z) float32.
+        mean: Weighted mean of the hits, (X, Y, Z, 3) float16.
+        axes: Principal axes of the hits, longest first, each as long as the standard deviation
+            along it; the last is the normal, pointing to the sensor's side,
+            (X, Y, Z, 3, 3) float16.
+        nearest: Offset in whole voxels to the voxel of the nearest feature, (X, Y, Z, 3) int8;
+            -128 where there is none within the horizon.
+        sdf: Signed distance of the voxel's centre to that feature, m, (X, Y, Z) float32.
+    """
+
+    hits: jax.Array
+    passes: jax.Array
+    behind: jax.Array
+    weight: jax.Array
+    mean: jax.Array
+    axes: jax.Array
+    nearest: jax.Array
+    sdf: jax.Array
+
+
+@flax.struct.dataclass
+class Network:
+    """The SIREN and its optimiser.
+
+    Attributes:
+        params: The weights that are trained.
+        served: The weights that queries use, a running average of `params`.
+        optimizer: The state of AdamW.
+        origin_world: Point that is the network's zero, (3,) m; `grow` does not move it.
+    """
+
+    params: Any
+    served: Any
+    optimizer: Any
+    origin_world: jax.Array
+
+
+@flax.struct.dataclass
+class MapState:
+    """Everything that an update needs and changes; made by `init`, changed by `update`.
+
+    Attributes:
+        config: The configuration; static, not a leaf.
+        grid: The coarse global grid.
+        network: The SIREN and its optimiser.
+        key: Source of all randomness, a typed key.
+        updates: Updates that changed the map so far, int32.
+        report: Scalars of the last update.
+    """
+
+    config: Config = flax.struct.field(pytree_node=False)
+    grid: Grid
+    network: Network
+    key: jax.Array
+    updates: jax.Array
+    report: Report
+
+
+@flax.struct.dataclass
+class Field:
+    """What a planner holds while the map goes on; made by `snapshot`.
+
+    Attributes:
+        config: The configuration; static, not a leaf.
+        params: The weights that queries use.
+        origin_world: Point that is the network's zero, (3,) m.
+        observed: Whether a ray has reached the voxel, (X, Y, Z) bool.
+        updates: Updates that the map had seen, int32.
+    """
+
+    config: Config = flax.struct.field(pytree_node=False)
+    params: Any
+    origin_world: jax.Array
+    observed: jax.Array
+    updates: jax.Array
+
+
+class Query(NamedTuple):
+    """What the map says of points.
+
+    Attributes:
+        sdf: Signed distance, (...) float32, m.
+        grad: Its gradient by the point, (..., 3) float32.
+        observed: Whether the voxel that contains the point has been seen, (...) bool.
+    """
+
+    sdf: jax.Array
+    grad: jax.Array
+    observed: jax.Array

@@ -1,0 +1,217 @@
+"""Shaded pictures of meshes, by a small software rasteriser: no GL, no display.
+
+Scan conversion is exact and vectorised over faces, so that a surface has no holes whatever the
+size of its triangles, and a million faces take seconds in numpy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import trimesh
+
+_SUPERSAMPLING = 2  # picture elements along each side of a pixel
+_ELEVATION = np.deg2rad(52)  # of the camera: high enough to see over the walls of a room
+_AZIMUTH = np.deg2rad(24)  # off the long side: a view square onto it shows no second wall
+_MARGIN = 0.03  # of the picture, left free on each side
+_FRAGMENTS_PER_BATCH = 1_000_000  # bounds the memory
+_AMBIENT = 0.2
+_LIGHT = np.array([-0.35, 0.7, 0.9])  # towards it: the picture's right, level to the viewer, up
+_PALETTE = np.array(  # by height, from low to high: pale, so that the shading carries the shape
+    [[0.80, 0.86, 0.94], [0.99, 0.93, 0.82], [0.98, 0.76, 0.56], [0.86, 0.57, 0.53]]
+)
+
+
+def save_shaded(
+    path: str | os.PathLike[str],
+    mesh: trimesh.Trimesh,
+    size: tuple[int, int] = (1280, 960),
+    up_world: Sequence[float] = (0.0, 0.0, 1.0),
+) -> None:
+    """Draws a mesh from above at an angle, shaded and tinted by height, on white.
+
+    Faces that look away from the camera are left out: one looks through the ceiling and the near
+    walls of a mapped room into it. The long side of the mesh lies across the picture.
+
+    Args:
+        path: The picture, in a format that its ending names (.png).
+        mesh: Faces with their normals towards free space, metres.
+        size: (width, height) in pixels.
+        up_world: (3,) the direction against gravity in the mesh's frame, of any length.
+
+    Raises:
+        ValueError: The mesh has no faces, size is not two positive numbers, or up_world is not a
+            finite (3,) vector other than zero.
+    """
+    import matplotlib.image
+
+    if not len(mesh.faces):
+        raise ValueError("mesh has 0 faces, expected at least 1")
+    if len(size) != 2 or min(size) < 1:
+        raise ValueError(f"size = {size}, expected (width, height) > 0 in pixels")
+    up = np.asarray(up_world, float)
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+        raise ValueError(f"up_world = {up_world}, expected 3 finite numbers, not all 0")
+    up = up / np.linalg.norm(up)
+    matplotlib.image.imsave(path, _shade(mesh, size, up))
+
+
+def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.ndarray:
+    """Renders; returns (height, width, 3) in 0..1."""
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    camera = _camera_axes(vertices, up)
+    width, height = (_SUPERSAMPLING * side for side in size)
+    image = np.ones((height, width, 3))
+
+    a, b, c = vertices[faces.T]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=-1)
+    shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
+    if not shown.any():
+        return image[::_SUPERSAMPLING, ::_SUPERSAMPLING]
+    normal = normal[shown] / length[shown, None]
+    corners = vertices[faces[shown]]  # (F, 3, 3)
+
+    view = corners @ camera.T  # metres along the picture's right, up and towards the viewer
+    lower, upper = view.min(axis=(0, 1)), view.max(axis=(0, 1))
+    extent = upper - lower
+    scale = (1 - 2 * _MARGIN) * min(width / extent[0], height / extent[1])  # pixels / m
+    middle = (lower + upper) / 2
+    column = (view[..., 0] - middle[0]) * scale + (width - 1) / 2
+    row = (middle[1] - view[..., 1]) * scale + (height - 1) / 2
+    depth = (upper[2] - view[..., 2]) * scale  # >= 0, pixels, away from the viewer
+    face, depth = _rasterise(np.stack([column, row, depth], axis=-1), width, height)
+    covered = face >= 0
+
+    light = _LIGHT @ np.stack([camera[0], np.cross(camera[0], up), up])
+    # Lambert's cosine, wrapped round: a wall in the shade still shows its shape.
+    cosine = normal @ light / np.linalg.norm(light)
+    brightness = _AMBIENT + (1 - _AMBIENT) * (1 + cosine) / 2
+    low, high = np.percentile(corners @ up, [1, 99])
+    stops = np.linspace(low, max(high, low + 1e-9), len(_PALETTE))
+    # Back from the picture to metres: the height of what each pixel shows.
+    rows, _ = np.nonzero(covered)
+    level = (middle[1] + ((height - 1) / 2 - rows) / scale) * (camera[1] @ up)
+    level += (upper[2] - depth[covered] / scale) * (camera[2] @ up)
+    tint = np.stack([np.interp(level, stops, channel) for channel in _PALETTE.T], axis=-1)
+    factor = brightness[face[covered]] * _occlusion(depth, covered)[covered]
+    image[covered] = tint * factor[:, None]
+    image = image.reshape(size[1], _SUPERSAMPLING, size[0], _SUPERSAMPLING, 3)
+    return np.clip(image.mean(axis=(1, 3)), 0, 1)
+
+
+def _camera_axes(vertices: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Returns (3, 3), the rows of which point right, up and to the viewer of the picture."""
+    # Any two axes that are level will do to find the long side in.
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    level = np.stack([first, np.cross(up, first)])
+    flat = (vertices - vertices.mean(axis=0)) @ level.T
+    long_side = np.linalg.eigh(flat.T @ flat)[1][:, 1] @ level
+    # Of its two directions the one along the largest axis of the frame, so that pictures of one
+    # place taken again do not turn round.
+    long_side *= np.sign(long_side[np.argmax(np.abs(long_side))])
+    away = np.cross(up, long_side)
+    right = np.cos(_AZIMUTH) * long_side + np.sin(_AZIMUTH) * away
+    back = np.cross(right, up)
+    viewer = np.cos(_ELEVATION) * back + np.sin(_ELEVATION) * up
+    return np.stack([right, np.cross(viewer, right), viewer])
+
+
+def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the nearest face at each pixel.
+
+    Args:
+        corners: (F, 3, 3); for each corner of each face its column, row and depth.
+        width: Columns; pixel centres are at integers.
+        height: Rows.
+
+    Returns:
+        face: (height, width) int, -1 where there is none.
+        depth: (height, width) its depth, inf where there is none.
+    """
+    # Depth in the high bits and the face in the low ones: one minimum finds both.
+    nothing = np.iinfo(np.int64).max
+    deepest = corners[..., 2].max(initial=1)
+    steps = (2**31 - 2) / deepest
+    buffer = np.full(height * width, nothing)
+    # depth = origin + slope . (column, row), the plane through the corners
+    edge_1, edge_2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(edge_1, edge_2)
+    normal[np.abs(normal[:, 2]) < 1e-12, 2] = np.inf
+    slope = -normal[:, :2] / normal[:, 2:]
+    origin = corners[:, 0, 2] - np.sum(slope * corners[:, 0, :2], axis=-1)
+    near, far = corners[..., 2].min(axis=1), corners[..., 2].max(axis=1)
+
+    slack = 1e-6  # pixels: neighbours round their common edge differently
+    first = np.ceil(corners[..., 1].min(axis=1) - slack).astype(int)
+    last = np.floor(corners[..., 1].max(axis=1) + slack).astype(int)
+    face, row = _ranges(first, last)
+    # On each row a face covers what lies between its edges there.
+    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for i in range(3):
+        (x0, y0), (x1, y1) = corners[face, i, :2].T, corners[face, (i + 1) % 3, :2].T
+        level = y1 == y0  # the ends of a level edge belong to the two others
+        t = (row - y0) / np.where(level, 1, y1 - y0)
+        crosses = ~level & (t >= -slack) & (t <= 1 + slack)
+        x = x0 + t * (x1 - x0)
+        left = np.where(crosses, np.minimum(left, x), left)
+        right = np.where(crosses, np.maximum(right, x), right)
+    found = right >= left
+    face, row = face[found], row[found]
+    left = np.ceil(left[found] - slack).astype(int)
+    right = np.floor(right[found] + slack).astype(int)
+
+    batch = np.cumsum(np.maximum(right - left + 1, 0)) // _FRAGMENTS_PER_BATCH
+    for rows in np.split(np.arange(len(row)), np.flatnonzero(np.diff(batch)) + 1):
+        span, column = _ranges(left[rows], right[rows])
+        span = rows[span]
+        which = face[span]
+        depth = origin[which] + slope[which, 0] * column + slope[which, 1] * row[span]
+        depth = np.clip(depth, near[which], far[which])  # a face on edge has any slope
+        key = ((depth * steps).astype(np.int64) << 32) | which
+        np.minimum.at(buffer, row[span] * width + column, key)
+    buffer = buffer.reshape(height, width)
+    empty = buffer == nothing
+    return (
+        np.where(empty, -1, buffer & (2**32 - 1)),
+        np.where(empty, np.inf, (buffer >> 32) / steps),
+    )
+
+
+def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lists the integers from first[i] to last[i] for all i; returns i and the integer, (n,)."""
+    count = np.maximum(last - first + 1, 0)
+    which = np.repeat(np.arange(len(count)), count)
+    before = np.cumsum(count) - count
+    return which, np.arange(len(which)) - before[which] + first[which]
+
+
+def _occlusion(depth: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Darkens what lies behind its surroundings, as a stand-in for ambient occlusion.
+
+    After Luft et al., Image enhancement by unsharp masking the depth buffer (SIGGRAPH 2006).
+
+    Args:
+        depth: (H, W) pixels.
+        covered: (H, W) bool.
+
+    Returns:
+        (H, W) factors <= 1.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    factor = np.ones(depth.shape)
+    known = np.where(covered, depth, 0).astype(np.float32)
+    for share in (1 / 300, 1 / 80):
+        radius = share * max(depth.shape)
+        weight = gaussian_filter(covered.astype(np.float32), radius, truncate=2)
+        around = gaussian_filter(known, radius, truncate=2) / np.maximum(weight, 1e-6)
+        behind = np.clip((known - around) / (8 * radius), 0, 1)
+        factor *= 1 - 0.35 * behind
+    return factor

@@ -1,0 +1,141 @@
+"""Level slices of a map as a picture: what it says, what is true, and the difference."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+_COLUMNS = 400  # samples along the longer side of a slice
+_CHUNK = 16384  # points in each query: one shape, so that a jitted map compiles once
+_ERROR_CM = 10.0  # end of the colour scale of errors
+_PANEL_INCHES = 5.0
+_SURFACE_REACH = 0.15  # m: surfaces lie at the edge of what was seen, or a voxel beyond
+
+
+def save_slices(
+    path: str | os.PathLike[str],
+    sdf: Callable[[np.ndarray], Any],
+    truth_sdf: Callable[[np.ndarray], Any] | None,
+    bounds: Sequence[Sequence[float]],
+    heights: Sequence[float],
+    path_world: np.ndarray | None = None,
+    observed: Callable[[np.ndarray], Any] | None = None,
+) -> None:
+    """Draws slices of a map at constant z of the world, one row a height (as the paper's Fig. 4).
+
+    Each row shows the map and, with `truth_sdf`, the exact distance on the same colours and the
+    signed error. Surfaces are black lines; what was not observed is grey.
+
+    Args:
+        path: The picture, in a format that its ending names.
+        sdf: Maps (n, 3) float32 points in the world, metres, to (n,) metres. Always called with the
+            same n, as are the other callables.
+        truth_sdf: The same, exact; None where there is no ground truth.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) metres, world; z is not used.
+        heights: Z of each slice, metres, world.
+        path_world: (F, 3) metres, the path of the sensor, drawn on top.
+        observed: Maps (n, 3) points to (n,) bool.
+
+    Raises:
+        ValueError: There are no heights, bounds is not (2, 3) with a positive size in x and y, or a
+            callable's answer is misshapen.
+    """
+    from matplotlib.figure import Figure  # without pyplot: Agg, whatever the user's backend is
+    from scipy.ndimage import maximum_filter
+
+    box = np.asarray(bounds, float)
+    if box.shape != (2, 3) or not (box[1, :2] > box[0, :2]).all():
+        raise ValueError(f"bounds = {bounds}, expected ((x0, y0, z0), (x1, y1, z1)), x0 < x1, ...")
+    if not len(heights):
+        raise ValueError("heights is empty, expected at least one z in metres")
+    x, y = _axes(box)
+    rows = []
+    for height in heights:
+        points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1)
+        panels = [_sample(sdf, points, "sdf")]
+        if truth_sdf is not None:
+            panels.append(_sample(truth_sdf, points, "truth_sdf"))
+            panels.append(100 * (panels[0] - panels[1]))
+        seen = None if observed is None else _sample(observed, points, "observed") > 0.5
+        rows.append((panels, seen))
+    # Where nothing was observed a map may say anything: that must not set the scale.
+    shown = [p[slice(None) if seen is None else seen] for ps, seen in rows for p in ps[:2]]
+    shown = np.abs(np.concatenate([panel.ravel() for panel in shown]))
+    limit = float(np.nanpercentile(shown, 99)) if shown.any() else 1.0
+
+    titles = ("map", "exact", "map - exact")[: len(rows[0][0])]
+    span = box[1, :2] - box[0, :2]
+    row_inches = _PANEL_INCHES * span[1] / span[0] + 0.45
+    figure = Figure(
+        figsize=(_PANEL_INCHES * len(titles) + 0.7, row_inches * len(rows) + 1.4),
+        layout="constrained",
+    )
+    grid = figure.subplots(len(rows), len(titles), squeeze=False, sharex=True, sharey=True)
+    image = {"extent": (*box[:, 0], *box[:, 1]), "origin": "lower", "interpolation": "nearest"}
+    distance = {"cmap": "RdBu", "vmin": -limit, "vmax": limit}
+    error = {"cmap": "PuOr_r", "vmin": -_ERROR_CM, "vmax": _ERROR_CM}
+    for axes, height, (panels, seen) in zip(grid, heights, rows, strict=True):
+        for i, (ax, panel) in enumerate(zip(axes, panels, strict=True)):
+            ax.imshow(panel, **image, **(error if i == 2 else distance))
+            if seen is not None:
+                ax.imshow(np.where(seen, np.nan, 0.78), **image, cmap="gray", vmin=0, vmax=1)
+            surface = panels[min(i, 1)]  # the error's panel shows where the surfaces truly are
+            # A distance without a sign never crosses zero: a line close by has to do.
+            level = 0.0 if np.nanmin(surface) < 0 else x[1] - x[0]
+            if i == 0 and seen is not None:
+                # Zeros far from all that was seen are the map's guesses, not surfaces.
+                samples = math.ceil(_SURFACE_REACH / (x[1] - x[0]))
+                surface = np.where(maximum_filter(seen, 2 * samples + 1), surface, np.nan)
+            finite = surface[np.isfinite(surface)]
+            if finite.size and finite.min() < level < finite.max():
+                ax.contour(x, y, surface, levels=[level], colors="black", linewidths=1.0)
+            if path_world is not None:
+                path_xy = np.asarray(path_world, float)[:, :2]
+                ax.plot(*path_xy.T, color="tab:green", linewidth=1.2)
+                ax.plot(*path_xy[0], "o", color="tab:green", markersize=4)
+            ax.set_title(f"{titles[i]}, z = {height:.2f} m", fontsize=11)
+            ax.set(xlim=box[:, 0], ylim=box[:, 1])
+        axes[0].set_ylabel("y [m]")
+    for ax in grid[-1]:
+        ax.set_xlabel("x [m]")
+    bar = {"location": "bottom", "extend": "both", "fraction": 0.05, "shrink": 0.7, "aspect": 40}
+    values = grid[0, 0].images[0]
+    figure.colorbar(values, ax=grid[:, :2], label="signed distance [m]", **bar)
+    if truth_sdf is not None:
+        bar |= {"aspect": 20}
+        figure.colorbar(grid[0, 2].images[0], ax=grid[:, 2], label="error [cm]", **bar)
+    notes = ["black: surface"]
+    notes += ["grey: not observed"] if observed is not None else []
+    notes += ["green: path of the sensor, from the dot"] if path_world is not None else []
+    figure.supxlabel("; ".join(notes), fontsize=9)
+    figure.savefig(path, dpi=110)
+
+
+def _axes(box: np.ndarray) -> list[np.ndarray]:
+    """Returns the centres of a grid of square cells over x and y."""
+    span = box[1, :2] - box[0, :2]
+    counts = np.maximum(np.rint(_COLUMNS * span / span.max()), 2).astype(int)
+    return [
+        low + (np.arange(count) + 0.5) * (extent / count)
+        for low, extent, count in zip(box[0, :2], span, counts, strict=True)
+    ]
+
+
+def _sample(function: Callable[[np.ndarray], Any], points: np.ndarray, name: str) -> np.ndarray:
+    """Evaluates a callable at (H, W, 3) points in chunks of one shape; returns (H, W) floats."""
+    flat = points.reshape(-1, 3).astype(np.float32)
+    values = np.empty(len(flat))
+    for start in range(0, len(flat), _CHUNK):
+        chunk = flat[start : start + _CHUNK]
+        n = len(chunk)
+        answer = np.asarray(function(np.pad(chunk, ((0, _CHUNK - n), (0, 0)), mode="edge")))
+        if answer.shape != (_CHUNK,):
+            raise ValueError(
+                f"{name} answered shape {answer.shape} for {_CHUNK} points, expected ({_CHUNK},)"
+            )
+        values[start : start + n] = answer[:n]
+    return values.reshape(points.shape[:2])

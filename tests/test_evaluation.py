@@ -1,0 +1,240 @@
+"""The metrics against values known in closed form and against a loop over scalars."""
+
+import math
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hiosdf_jax import evaluation
+from hiosdf_jax.evaluation import GroundTruth, evaluate, format_table, held_out_surface
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+CENTER = np.array([0.3, -0.2, 0.1])
+RADIUS = 0.7
+
+
+def sphere(points):
+    offset = points - CENTER
+    distance = np.linalg.norm(offset, axis=-1)
+    return distance - RADIUS, offset / distance[..., None]
+
+
+def sphere_truth(count=500, seed=0):
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    distance = rng.uniform(0.01, 2.0, count)
+    points = (CENTER + direction * (RADIUS + distance[:, None])).astype(np.float32)
+    sdf, grad = sphere(points.astype(float))
+    return GroundTruth(
+        points_world=points,
+        sdf=sdf.astype(np.float32),
+        grad=grad.astype(np.float32),
+        frame=rng.integers(0, 10, count).astype(np.int32),
+        surface_points_world=(CENTER + direction[:77] * RADIUS).astype(np.float32),
+    )
+
+
+def test_an_exact_map_scores_perfectly():
+    scores = evaluate(sphere, sphere_truth(), sensor_position_world=CENTER)
+    for key in ("visible_cm", "near_cm", "within_3m_cm", "bias_cm", "surface_cm"):
+        assert scores[key] == pytest.approx(0, abs=2e-5), key
+    assert scores["eikonal"] == pytest.approx(0, abs=1e-6)
+    assert scores["cosine"] == pytest.approx(0, abs=1e-6)
+    assert scores["recall"] == 1
+    assert scores["fpr"] == 0
+
+
+def test_a_known_error_gives_known_scores():
+    # 2 cm too far, gradient twice as long and turned by 60 degrees about an orthogonal axis.
+    def wrong(points):
+        sdf, grad = sphere(points)
+        sideways = np.cross(grad, [0.1, 0.2, 0.97])
+        sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
+        return sdf + 0.02, 2 * (0.5 * grad + math.sqrt(0.75) * sideways)
+
+    scores = evaluate(wrong, sphere_truth())
+    assert scores["visible_cm"] == pytest.approx(2, abs=1e-4)
+    assert scores["bias_cm"] == pytest.approx(2, abs=1e-4)
+    assert scores["surface_cm"] == pytest.approx(2, abs=1e-4)
+    assert scores["eikonal"] == pytest.approx(1, abs=1e-5)
+    assert scores["cosine"] == pytest.approx(0.5, abs=1e-5)
+    assert scores["recall"] < 1
+    assert scores["fpr"] == 0
+    too_near = evaluate(lambda p: (sphere(p)[0] - 0.02, sphere(p)[1]), sphere_truth())
+    assert too_near["bias_cm"] == pytest.approx(-2, abs=1e-4)
+    assert too_near["recall"] == 1
+    assert too_near["fpr"] > 0
+    assert "within_3m_cm" not in scores
+
+
+@pytest.mark.parametrize("last_frame", [None, 4])
+def test_scores_equal_a_loop_over_scalars(last_frame):
+    truth = sphere_truth()
+    sensor = np.array([1.5, 0.5, 0.0])
+
+    def noisy(points):
+        sdf, grad = sphere(points)
+        ripple = 0.1 * np.sin(9 * points)
+        return sdf + ripple.sum(-1), grad + ripple
+
+    scores = evaluate(noisy, truth, sensor_position_world=sensor, last_frame=last_frame)
+
+    # The rule of peers.json: one radius for each point of the file, whatever is then left out.
+    radii = np.random.default_rng(1).uniform(0.05, 0.4, len(truth.sdf))
+    error, near, local, signed, eikonal, cosine = [], [], [], [], [], []
+    true, called_true, false, called_false = 0, 0, 0, 0
+    for point, d, g, frame, radius in zip(*truth[:4], radii, strict=True):
+        if last_frame is not None and frame > last_frame:
+            continue
+        map_d, map_g = (a[0] for a in noisy(point[None]))
+        signed.append(map_d - d)
+        error.append(abs(map_d - d))
+        if d < 0.5:
+            near.append(abs(map_d - d))
+        if math.dist(point, sensor) < 3:
+            local.append(abs(map_d - d))
+        eikonal.append(abs(math.hypot(*map_g) - 1))
+        cosine.append(1 - sum(a * b for a, b in zip(map_g, g, strict=True)) / math.hypot(*map_g))
+        if d < radius:
+            true += 1
+            called_true += map_d < radius
+        else:
+            false += 1
+            called_false += map_d < radius
+    assert len(local) < len(error)  # the radius of 3 m must matter here
+    expected = {
+        "visible_cm": 100 * np.mean(error),
+        "near_cm": 100 * np.mean(near),
+        "within_3m_cm": 100 * np.mean(local),
+        "bias_cm": 100 * np.mean(signed),
+        "eikonal": np.mean(eikonal),
+        "cosine": np.mean(cosine),
+        "recall": called_true / true,
+        "fpr": called_false / false,
+    }
+    for key, value in expected.items():
+        assert scores[key] == pytest.approx(value, rel=1e-4), key
+
+
+def test_surface_has_no_score_while_frames_are_left_out():
+    truth = sphere_truth()
+    assert math.isnan(evaluate(sphere, truth, last_frame=3)["surface_cm"])
+    assert math.isfinite(evaluate(sphere, truth, last_frame=9)["surface_cm"])
+
+
+@pytest.mark.parametrize("count", [1, evaluation._CHUNK, evaluation._CHUNK + 1])
+def test_a_jitted_map_compiles_once_and_keeps_the_order(count):
+    traces = []
+
+    @jax.jit
+    def first_coordinate(points):
+        traces.append(points.shape)
+        return points[:, 0], points
+
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(count, 3)).astype(np.float32)
+    truth = GroundTruth(points, points[:, 0], points, np.zeros(count, np.int32), points[:3])
+    scores = evaluate(first_coordinate, truth)
+    assert scores["visible_cm"] == 0
+    assert scores["cosine"] == pytest.approx(0, abs=1e-6)
+    assert len(traces) == 1
+
+
+def test_a_map_is_asked_about_given_points_only():
+    truth = sphere_truth()
+    asked = []
+
+    def remember(points):
+        asked.append(points)
+        return sphere(points)
+
+    evaluate(remember, truth)
+    given = np.concatenate([truth.points_world, truth.surface_points_world])
+    assert {*map(tuple, np.concatenate(asked))} == {*map(tuple, given)}
+
+
+def test_gradients_of_zero_count_as_orthogonal():
+    scores = evaluate(lambda p: (sphere(p)[0], np.zeros_like(p)), sphere_truth())
+    assert scores["cosine"] == 1
+    assert scores["eikonal"] == 1
+    opposite = evaluate(lambda p: (sphere(p)[0], -sphere(p)[1]), sphere_truth())
+    assert opposite["cosine"] == pytest.approx(2)
+
+
+def test_nan_is_not_hidden():
+    def holed(points):
+        sdf, grad = sphere(points)
+        return np.where(points[:, 0] > 1, np.nan, sdf), grad
+
+    scores = evaluate(holed, sphere_truth())
+    for key in ("visible_cm", "bias_cm", "recall", "fpr"):
+        assert math.isnan(scores[key]), key
+
+
+def test_misuse_is_named():
+    truth = sphere_truth(20)
+    with pytest.raises(ValueError, match=r"truth.grad has shape \(20,\), expected \(20, 3\)"):
+        evaluate(sphere, truth._replace(grad=truth.sdf))
+    with pytest.raises(ValueError, match="last_frame = -1"):
+        evaluate(sphere, truth, last_frame=-1)
+    with pytest.raises(ValueError, match=r"sensor_position_world has shape \(2,\)"):
+        evaluate(sphere, truth, sensor_position_world=[0, 0])
+    with pytest.raises(ValueError, match="the map answered sdf of shape"):
+        evaluate(lambda p: (sphere(p)[0][:, None], p), truth)
+    with pytest.raises(ValueError, match="points_world has shape"):
+        held_out_surface(lambda p: p[:, 0], np.zeros((0, 3)))
+
+
+def test_held_out_surface():
+    points = np.zeros((evaluation._CHUNK + 9, 3), np.float32)
+    points[:, 0] = np.linspace(-0.2, 0.2, len(points))
+    scores = held_out_surface(lambda p: p[:, 0], points)
+    assert scores["median_cm"] == pytest.approx(10, rel=1e-3)
+    assert scores["mean_cm"] == pytest.approx(10, rel=1e-3)
+    assert scores["p90_cm"] == pytest.approx(18, rel=1e-3)
+
+
+def test_table():
+    scores = {"visible_cm": 1.234, "recall": 0.98765, "surface_cm": math.nan}
+    peers = {
+        "hio_sdf": {"visible_cm": [2.0, 4.0], "note": "text"},
+        "nothing": {"note": "text"},
+        "nested": {"a": {"visible_cm": 1.0}},
+    }
+    table = format_table(scores, peers)
+    lines = table.splitlines()
+    assert lines[0].split() == ["metric", "unit", "better", "ours", "hio_sdf"]
+    assert set(lines[1]) == {"-"}
+    assert lines[2].split()[-4:] == ["cm", "lower", "1.23", "3.00"]
+    assert lines[3].split()[-4:] == ["cm", "lower", "-", "-"]
+    assert lines[4].split()[-4:] == ["-", "higher", "0.988", "-"]
+    assert len({line.index("cm") for line in lines[2:4]}) == 1
+    assert "peer" not in format_table(scores)
+    # Whatever evaluate returns has a row.
+    full = evaluate(sphere, sphere_truth(), sensor_position_world=CENTER)
+    assert len(format_table(full).splitlines()) == 2 + len(full)
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs ../shared/data")
+def test_the_recorded_distances_score_perfectly_on_themselves():
+    from scipy.spatial import cKDTree
+
+    from hiosdf_jax.datasets import ground_truth
+
+    truth = ground_truth(SHARED / "house_depth.npz")
+    points = np.concatenate([truth.points_world, truth.surface_points_world])
+    sdf = np.concatenate([truth.sdf, np.zeros(len(truth.surface_points_world))])
+    grad = np.concatenate([truth.grad, np.zeros_like(truth.surface_points_world)])
+    tree = cKDTree(points)
+
+    def lookup(query):
+        nearest = tree.query(query)[1]
+        return sdf[nearest], grad[nearest]
+
+    scores = evaluate(lookup, truth)
+    assert max(scores["visible_cm"], scores["surface_cm"], scores["fpr"]) == 0
+    assert scores["recall"] == 1
+    assert scores["cosine"] == pytest.approx(0, abs=1e-6)
