@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from typing import Any
 
@@ -104,6 +105,34 @@ def snapshot(state: MapState) -> Field:
     )
 
 
+def grow(state: MapState, bounds: Any) -> MapState:
+    """Enlarges the box of a map and keeps all that it knows.
+
+    Args:
+        state: The map; not inside jit, since the arrays change their shapes.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; contains the old bounds.
+
+    Returns:
+        The map in the new box. Inside the old one it answers bit by bit as before.
+
+    Raises:
+        ValueError: The new bounds do not contain the old ones.
+    """
+    old = state.config
+    new = dataclasses.replace(old, bounds=bounds)
+    contained = np.all(np.asarray(new.bounds[0]) <= old.bounds[0]) and np.all(
+        np.asarray(new.bounds[1]) >= old.bounds[1]
+    )
+    if not contained:
+        raise ValueError(f"bounds is {bounds!r}, expected a box that contains {old.bounds!r}")
+    start = np.subtract(old.corner_index, new.corner_index)
+    place = tuple(slice(a, a + n) for a, n in zip(start, old.grid_shape, strict=True))
+    grid = jax.tree.map(
+        lambda empty, known: empty.at[place].set(known), _empty_grid(new), state.grid
+    )
+    return state.replace(config=new, grid=grid)
+
+
 def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
@@ -199,7 +228,7 @@ def _empty_grid(config: Config) -> Grid:
         mean=jnp.zeros((*shape, 3), jnp.float16),
         axes=jnp.zeros((*shape, 3, 3), jnp.float16),
         nearest=jnp.full((*shape, 3), distance.NO_FEATURE, jnp.int8),
-        sdf=jnp.full(shape, config.distance_horizon),
+        sdf=jnp.full(shape, config.distance_horizon, jnp.float32),
     )
 
 

@@ -1,0 +1,382 @@
+"""The contract of the whole map: purity, transformations, bad input, growth, persistence."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hiosdf_jax as hio
+from hiosdf_jax import mapping
+
+BOUNDS = ((-1.2, -1.0, -0.8), (1.2, 1.0, 0.8))
+CONFIG = hio.Config.light(
+    BOUNDS,
+    max_points=300,
+    max_range=4.0,
+    distance_horizon=1.0,
+    near_samples=400,
+    far_samples=400,
+    local_points=20,
+    local_ray_samples=5,
+    hidden_width=16,
+    hidden_layers=1,
+    batches=2,
+    warmup_updates=2,
+    warmup_epochs=4,
+)
+
+
+# Not on faces of voxels, where rounding decides which voxel a return falls in.
+HALF = np.array([0.97, 0.78, 0.56])
+
+
+def room_cloud(seed, count=250, yaw=0.0, position=(0.0, 0.0, 0.0)):
+    """Exact returns of a sensor inside the box |x, y, z| < HALF."""
+    rng = np.random.default_rng(seed)
+    rays = rng.normal(size=(count, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    pose = np.eye(4, dtype=np.float32)
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = position
+    world_rays = rays @ pose[:3, :3].T
+    reach = (HALF * np.sign(world_rays) - position) / world_rays
+    cloud = rays * reach.min(axis=1, keepdims=True)
+    return cloud.astype(np.float32), pose
+
+
+def stream(frames=4, count=250):
+    return [
+        room_cloud(i, count, 0.3 * i, (0.1 * i - 0.2, 0.05 * i, 0.02 * i)) for i in range(frames)
+    ]
+
+
+def arrays_equal(a, b):
+    def plain(tree):
+        return [
+            np.asarray(
+                jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+            )
+            for x in jax.tree.leaves(tree)
+        ]
+
+    return all(
+        np.array_equal(x, y, equal_nan=True) for x, y in zip(plain(a), plain(b), strict=True)
+    )
+
+
+def closeness(a, b):
+    """Largest difference between two maps' answers, m."""
+    points = np.random.default_rng(0).uniform(BOUNDS[0], BOUNDS[1], (500, 3)).astype(np.float32)
+    return float(jnp.max(jnp.abs(hio.sdf(a, points) - hio.sdf(b, points))))
+
+
+@pytest.fixture(scope="module")
+def empty():
+    return hio.init(CONFIG, jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def mapped(empty):
+    state = empty
+    for cloud, pose in stream():
+        state = hio.update(state, cloud, pose)
+    return state
+
+
+def test_the_map_learns_the_room():
+    """All stages together, at a size that can learn: a box has an exact SDF."""
+    config = dataclasses.replace(
+        CONFIG, near_samples=2000, far_samples=4000, hidden_width=64, epochs=20, max_points=2000
+    )
+    state = hio.init(config, jax.random.key(0))
+    for cloud, pose in stream(12, 2000):
+        state = hio.update(state, cloud, pose)
+    points = np.random.default_rng(1).uniform(-0.95, 0.95, (2000, 3)) * HALF
+    gaps = HALF - np.abs(points)
+    exact = gaps.min(axis=1)
+    answer = hio.query(state, points)
+    assert np.abs(np.asarray(answer.sdf) - exact).mean() < 0.02
+    assert np.asarray(answer.observed).mean() > 0.98
+    # Near one wall and far from the others the gradient is that wall's normal.
+    sure = (exact < 0.15) & (np.sort(gaps, axis=1)[:, 1] > 0.3)
+    wall = np.argmin(gaps[sure], axis=1)
+    normal = -np.sign(points[sure]) * (np.arange(3) == wall[:, None])
+    assert sure.sum() > 50
+    assert np.mean(np.sum(np.asarray(answer.grad)[sure] * normal, axis=1)) > 0.9
+    outside = hio.query(state, np.array([[9.0, 0, 0], [0, 0, -7.0]]))
+    assert not np.asarray(outside.observed).any()
+
+
+def test_update_is_pure(empty):
+    cloud, pose = stream(1)[0]
+    before = jax.tree.map(jnp.copy, empty)
+    first = hio.update(empty, cloud, pose)
+    again = hio.update(empty, cloud, pose)
+    assert arrays_equal(first, again)
+    assert arrays_equal(before, empty)
+    assert not arrays_equal(first.grid, empty.grid)
+
+
+def test_no_leaf_is_weakly_typed(empty, mapped):
+    """A weakly typed leaf would compile `update` twice."""
+    for state in (empty, mapped):
+        assert not [leaf for leaf in jax.tree.leaves(state) if getattr(leaf, "weak_type", False)]
+
+
+def test_one_compilation_for_clouds_of_any_size():
+    config = dataclasses.replace(CONFIG, hidden_width=8)
+    state = hio.init(config, jax.random.key(0))
+    before = mapping._update_jit._cache_size()
+    for count in (1, 40, 299, 300, 301, 900):
+        state = hio.update(state, *room_cloud(count, count))
+    assert mapping._update_jit._cache_size() == before + 1
+    assert int(state.updates) == 6
+    assert int(state.report.points_used) == 300
+
+
+def test_scan_and_user_jit_equal_the_eager_loop(empty, mapped):
+    clouds, poses = (jnp.stack(part) for part in zip(*stream(), strict=True))
+
+    @jax.jit
+    def scanned(state, clouds, poses):
+        return jax.lax.scan(lambda s, x: (hio.update(s, *x), s.report), state, (clouds, poses))
+
+    last, reports = scanned(empty, clouds, poses)
+    # The cloud is not padded inside jit (250 rows, not 300): the result must not depend on that.
+    assert arrays_equal(last.grid.hits, mapped.grid.hits)
+    assert closeness(last, mapped) < 1e-5
+    assert int(last.updates) == 4
+    assert reports.points_used.shape == (4,)
+
+    @jax.jit
+    def planner(state, cloud, pose, points):
+        return hio.sdf_and_grad(hio.update(state, cloud, pose), points)
+
+    cloud, pose = stream(1)[0]
+    points = jnp.zeros((5, 3))
+    value, gradient = planner(empty, cloud, pose, points)
+    expected = hio.sdf_and_grad(hio.update(empty, cloud, pose), points)
+    np.testing.assert_allclose(value, expected[0], atol=1e-5)
+    np.testing.assert_allclose(gradient, expected[1], atol=1e-4)
+
+
+def test_vmap_over_two_maps_equals_each(empty):
+    other = hio.init(CONFIG, jax.random.key(1))
+    frames = stream(2)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), empty, other)
+    clouds, poses = (jnp.stack(part) for part in zip(*frames, strict=True))
+    together = jax.jit(jax.vmap(hio.update))(both, clouds, poses)
+    for k, state in enumerate((empty, other)):
+        alone = hio.update(state, *frames[k])
+        part = jax.tree.map(lambda leaf, k=k: leaf[k], together)
+        assert arrays_equal(part.grid.hits, alone.grid.hits)
+        assert arrays_equal(part.grid.passes, alone.grid.passes)
+        assert closeness(part, alone) < 1e-4
+
+
+def test_invalid_rows_change_nothing(empty):
+    cloud, pose = stream(1)[0]
+    rows = np.full((300, 3), np.nan, np.float32)
+    rows[:250] = cloud
+    rows[260] = [np.inf, 0, 0]
+    rows[270] = [0, -np.inf, np.nan]
+    a, b = hio.update(empty, cloud, pose), hio.update(empty, rows, pose)
+    assert arrays_equal(a.grid, b.grid)
+    assert arrays_equal(a.network, b.network)
+    assert int(b.report.points_invalid) == 50
+
+
+BAD = {
+    "empty cloud": (np.zeros((0, 3)), np.eye(4), "cloud has no finite row among its 0"),
+    "NaN cloud": (np.full((7, 3), np.nan), np.eye(4), "cloud has no finite row among its 7"),
+    "NaN pose": (np.ones((2, 3)), np.full((4, 4), np.nan), "pose has values that are not finite"),
+    "scaled pose": (np.ones((2, 3)), np.diag([2.0, 2, 2, 1]), "pose is not rigid"),
+    "mirrored pose": (np.ones((2, 3)), np.diag([-1.0, 1, 1, 1]), "pose is not rigid"),
+    "bad last row": (np.ones((2, 3)), np.diag([1.0, 1, 1, 2]), "pose is not rigid"),
+    "flat cloud": (np.ones(6), np.eye(4), r"cloud has shape \(6,\), expected \(N, 3\)"),
+    "wide cloud": (np.ones((2, 4)), np.eye(4), r"cloud has shape \(2, 4\), expected \(N, 3\)"),
+    "small pose": (np.ones((2, 3)), np.eye(3), r"pose has shape \(3, 3\), expected \(4, 4\)"),
+}
+
+
+@pytest.mark.parametrize("cloud, pose, message", BAD.values(), ids=BAD.keys())
+def test_bad_input_raises_and_names_the_argument(mapped, cloud, pose, message):
+    before = jax.tree.map(jnp.copy, mapped)
+    with pytest.raises(ValueError, match=message):
+        hio.update(mapped, cloud, pose)
+    assert arrays_equal(before, mapped)
+
+
+@pytest.mark.parametrize(
+    "cloud, pose, flag",
+    [
+        (np.full((5, 3), np.nan), np.eye(4), hio.Flag.EMPTY_CLOUD),
+        (np.ones((5, 3)), np.full((4, 4), np.nan), hio.Flag.BAD_POSE),
+        (np.ones((5, 3)), np.diag([2.0, 2, 2, 1]), hio.Flag.BAD_POSE),
+        (
+            np.full((5, 3), np.nan),
+            np.diag([2.0, 2, 2, 1]),
+            hio.Flag.BAD_POSE | hio.Flag.EMPTY_CLOUD,
+        ),
+    ],
+)
+def test_bad_input_inside_jit_only_raises_a_sticky_flag(mapped, cloud, pose, flag):
+    after = jax.jit(hio.update)(mapped, jnp.asarray(cloud), jnp.asarray(pose))
+    assert hio.Flag(int(after.report.flags)) == flag
+    flags = mapped.report.flags
+    assert arrays_equal(after.replace(report=after.report.replace(flags=flags)), mapped)
+    later = hio.update(after, *stream(1)[0])
+    assert hio.Flag(int(later.report.flags)) == flag
+
+
+def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty):
+    cloud = np.array([[3.0, 0.01, 0.01], [0.7, 0.01, 0.01]], np.float32)
+    state = hio.update(empty, cloud, np.eye(4))
+    assert int(state.report.points_outside) == 1
+    assert int(state.report.points_used) == 1
+    assert hio.Flag(int(state.report.flags)) == hio.Flag.POINTS_OUTSIDE
+    assert float(jnp.sum(state.grid.hits)) == 1
+    assert float(state.grid.passes[-1, 10, 8]) > 0
+    # A sensor that is far outside of the box with all its points must not harm the map either.
+    pose = np.eye(4)
+    pose[0, 3] = 50
+    far = hio.update(state, cloud, pose)
+    assert arrays_equal(far.grid.hits, state.grid.hits)
+    assert np.isfinite(np.asarray(hio.sdf(far, np.zeros((1, 3))))).all()
+
+
+def test_range_limits_are_counted(empty):
+    cloud = np.array([[0.01, 0, 0], [5.0, 0.0, 0], [0.5, 0, 0]], np.float32)
+    state = hio.update(empty, cloud, np.eye(4))
+    assert int(state.report.points_out_of_range) == 2
+    assert int(state.report.points_used) == 1
+    assert float(jnp.sum(state.grid.hits)) == 1
+
+
+def test_equivariance_to_moves_by_whole_voxels(mapped):
+    """The same stream in a box moved by whole voxels gives the same map, moved."""
+    move = np.array([3.0, -2.0, 1.0], np.float32)  # multiples of 0.1 m; exact in binary
+    moved = dataclasses.replace(
+        CONFIG, bounds=tuple(tuple(np.add(corner, move)) for corner in BOUNDS)
+    )
+    state = hio.init(moved, jax.random.key(0))
+    for cloud, pose in stream():
+        pose = pose.copy()
+        pose[:3, 3] += move
+        state = hio.update(state, cloud, pose)
+    assert np.mean(np.asarray(state.grid.hits != mapped.grid.hits)) < 0.01
+    points = np.random.default_rng(2).uniform(-0.5, 0.5, (200, 3)).astype(np.float32)
+    difference = hio.sdf(state, points + move) - hio.sdf(mapped, points)
+    assert float(jnp.mean(jnp.abs(difference))) < 0.02
+
+
+def test_snapshot_is_independent_of_a_donated_map(empty):
+    state = hio.update(empty, *stream(1)[0])
+    field = hio.snapshot(state)
+    points = np.zeros((3, 3))
+    before = hio.query(field, points)
+    assert arrays_equal(before, hio.query(state, points))
+    jax.jit(hio.update, donate_argnums=0)(state, *(jnp.asarray(x) for x in stream(1)[0]))
+    assert arrays_equal(hio.query(field, points), before)
+    assert int(field.updates) == 1
+
+
+def test_grow_keeps_every_value(mapped):
+    larger = ((-2.05, -1.0, -1.5), (1.2, 3.0, 0.8))
+    grown = hio.grow(mapped, larger)
+    points = np.random.default_rng(3).uniform(*BOUNDS, (400, 3)).astype(np.float32)
+    assert arrays_equal(hio.query(grown, points), hio.query(mapped, points))
+    assert grown.config.grid_shape == (33, 40, 23)
+    # Mapping goes on in the new part.
+    pose = np.eye(4)
+    pose[:3, 3] = [0, 2.0, 0]
+    for _ in range(3):
+        grown = hio.update(grown, np.array([[0.05, 0.55, 0.05]]), pose)
+    beyond = hio.query(grown, np.array([[0.0, 2.3, 0.0], [0.0, 2.9, 0.0]]))
+    assert np.asarray(beyond.observed).tolist() == [True, False]
+    with pytest.raises(ValueError, match="bounds is .*, expected a box that contains"):
+        hio.grow(mapped, ((-1, -1, -1), (3, 3, 3)))
+
+
+def test_a_grown_map_is_as_good_as_one_of_that_size(empty):
+    """Distances across the old border are those of a map that had the larger box at once."""
+    larger = ((-1.2, -1.0, -0.8), (2.4, 1.0, 0.8))
+    once = hio.init(dataclasses.replace(CONFIG, bounds=larger), jax.random.key(0))
+    grown = hio.grow(empty, larger)
+    for cloud, pose in stream(2):
+        once, grown = hio.update(once, cloud, pose), hio.update(grown, cloud, pose)
+    assert arrays_equal(once.grid, grown.grid)
+
+
+def test_save_load_and_go_on_is_bit_identical(mapped, tmp_path):
+    path = tmp_path / "map.npz"
+    hio.save(path, mapped)
+    loaded = hio.load(path)
+    assert loaded.config == mapped.config
+    assert arrays_equal(loaded, mapped)
+    frame = stream(6)[5]
+    assert arrays_equal(hio.update(loaded, *frame), hio.update(mapped, *frame))
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+def test_a_failed_save_keeps_the_old_file(mapped, tmp_path, monkeypatch):
+    path = tmp_path / "map.npz"
+    hio.save(path, mapped)
+    before = path.read_bytes()
+
+    def fail(*_, **__):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        hio.save(path, mapped)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+def test_load_names_what_is_wrong(mapped, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        hio.load(tmp_path / "none.npz")
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(ValueError, match=r"broken.npz is not a readable"):
+        hio.load(broken)
+    foreign = tmp_path / "foreign.npz"
+    np.savez(foreign, a=np.zeros(3))
+    with pytest.raises(ValueError, match=r"foreign.npz is not a hiosdf_jax map"):
+        hio.load(foreign)
+    path = tmp_path / "map.npz"
+    hio.save(path, mapped)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    short = {name: array for name, array in arrays.items() if name != "grid.hits"}
+    np.savez(path, **short)
+    with pytest.raises(ValueError, match="lacks the array grid.hits"):
+        hio.load(path)
+    np.savez(path, **(arrays | {"grid.hits": arrays["grid.hits"][1:]}))
+    with pytest.raises(ValueError, match="has grid.hits of float32"):
+        hio.load(path)
+    newer = str(arrays["header"]).replace('"version": 1', '"version": 99')
+    np.savez(path, **(arrays | {"header": np.asarray(newer)}))
+    with pytest.raises(ValueError, match="format version 99, expected at most 1"):
+        hio.load(path)
+
+
+def test_init_and_queries_name_wrong_arguments(mapped):
+    with pytest.raises(ValueError, match="config is dict"):
+        hio.init({}, jax.random.key(0))
+    with pytest.raises(ValueError, match="key has dtype"):
+        hio.init(CONFIG, 0)
+    with pytest.raises(ValueError, match="state is NoneType"):
+        hio.update(None, np.ones((1, 3)), np.eye(4))
+    with pytest.raises(ValueError, match=r"points has shape \(2,\), expected \(..., 3\)"):
+        hio.sdf(mapped, np.zeros(2))
+    with pytest.raises(ValueError, match="field is int"):
+        hio.query(3, np.zeros(3))
+    with pytest.raises(ValueError, match="state is int"):
+        hio.save("nowhere", 3)
+    old_style = hio.init(CONFIG, jax.random.PRNGKey(0))
+    assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))

@@ -1,0 +1,110 @@
+"""Queries: defined everywhere, differentiable, the same one by one and by the thousand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hiosdf_jax as hio
+
+BOUNDS = ((-1.0, -2.0, 0.0), (3.0, 1.0, 2.0))
+CONFIG = hio.Config.light(BOUNDS, hidden_width=32, max_points=64)
+
+
+@pytest.fixture(scope="module")
+def field():
+    return hio.snapshot(hio.init(CONFIG, jax.random.key(3)))
+
+
+def points_around(count, spread=4.0):
+    return np.random.default_rng(0).uniform(-spread, spread, (count, 3)).astype(np.float32)
+
+
+def test_shapes_and_batch_equals_scalar(field):
+    points = points_around(24)
+    together = hio.query(field, points.reshape(2, 3, 4, 3))
+    assert together.sdf.shape == (2, 3, 4)
+    assert together.grad.shape == (2, 3, 4, 3)
+    assert together.observed.shape == (2, 3, 4)
+    for k, point in enumerate(points):
+        alone = hio.query(field, point)
+        np.testing.assert_allclose(alone.sdf, together.sdf.ravel()[k], atol=1e-5)
+        np.testing.assert_allclose(alone.grad, together.grad.reshape(-1, 3)[k], atol=1e-4)
+    mapped = jax.vmap(lambda p: hio.sdf(field, p))(points)
+    np.testing.assert_allclose(mapped, together.sdf.ravel(), atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [32_769, 40_000])
+def test_eager_equals_jit_at_sizes_that_xla_has_got_wrong(field, rows):
+    points = points_around(rows)
+    eager = hio.sdf_and_grad(field, points)
+    jitted = jax.jit(hio.sdf_and_grad)(field, points)
+    np.testing.assert_allclose(jitted[0], eager[0], atol=1e-5)
+    np.testing.assert_allclose(jitted[1], eager[1], atol=1e-4)
+    values = jax.jit(jax.vmap(lambda p: hio.sdf(field, p)))(points)
+    np.testing.assert_allclose(values, eager[0], atol=1e-5)
+
+
+def test_gradient_equals_finite_differences_inside_and_outside(field):
+    points = points_around(200, 3.0)
+    inside = np.all((points > BOUNDS[0]) & (points < BOUNDS[1]), axis=1)
+    assert 5 < inside.sum() < 195
+    step = 2e-3
+    _, gradient = hio.sdf_and_grad(field, points)
+    for axis in range(3):
+        shift = np.zeros(3, np.float32)
+        shift[axis] = step
+        slope = (hio.sdf(field, points + shift) - hio.sdf(field, points - shift)) / (2 * step)
+        # A point that crosses a face of the box within the step has no derivative.
+        low, high = np.array(BOUNDS)
+        away = np.all(np.minimum(abs(points - low), abs(points - high)) > 2 * step, axis=1)
+        np.testing.assert_allclose(gradient[away, axis], slope[away], atol=5e-3)
+
+
+def test_outside_the_value_is_the_distance_to_the_box_more(field):
+    corner = np.array([3.0, 1.0, 2.0], np.float32)
+    beyond = corner + np.array([3.0, 4.0, 0.0], np.float32)
+    np.testing.assert_allclose(hio.sdf(field, beyond), hio.sdf(field, corner) + 5.0, rtol=1e-5)
+    _, gradient = hio.sdf_and_grad(field, beyond)
+    np.testing.assert_allclose(gradient[:2], [0.6, 0.8], atol=1e-5)
+
+
+def test_extreme_points_give_finite_answers(field):
+    extremes = np.array(
+        [
+            [3e38, -3e38, 3e38],
+            [1e30, 0, 0],
+            [np.inf, 0, -np.inf],
+            [1e-40, -1e-40, 0],
+            [0, 0, 0],
+            [-1.0, -2.0, 0.0],
+            [3.0, 1.0, 2.0],
+            [1e-6 + 3.0, 1.0, 2.0],
+        ],
+        np.float32,
+    )
+    answer = hio.query(field, extremes)
+    assert np.isfinite(np.asarray(answer.sdf)).all()
+    assert np.isfinite(np.asarray(answer.grad)).all()
+    assert not np.asarray(answer.observed).any()
+
+
+def test_the_map_is_a_traced_argument():
+    traces = []
+
+    @jax.jit
+    def cost(field, points):
+        traces.append(1)
+        return jnp.sum(jax.nn.relu(0.3 - hio.sdf(field, points)))
+
+    points = points_around(10, 1.0)
+    costs = {float(cost(hio.init(CONFIG, jax.random.key(k)), points)) for k in range(4)}
+    assert len(costs) == 4
+    assert len(traces) == 1
+
+
+def test_queries_are_differentiable_by_the_weights(field):
+    gradient = jax.grad(lambda f: jnp.sum(hio.sdf(f, points_around(5))), allow_int=True)(field)
+    norms = [float(jnp.linalg.norm(leaf)) for leaf in jax.tree.leaves(gradient.params)]
+    assert all(np.isfinite(norms))
+    assert max(norms) > 0
