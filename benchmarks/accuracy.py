@@ -35,7 +35,8 @@ def score_stream(path: Path, config_name: str, seed: int) -> dict[str, Any]:
     state = hio.init(config, jax.random.key(seed))
     times_ms = []
     pose = np.eye(4)
-    for cloud, pose in tqdm(stream, desc=f"{path.stem} {config_name} seed {seed}"):
+    for frame in tqdm(range(len(stream)), desc=f"{path.stem} {config_name} seed {seed}"):
+        cloud, pose = stream[frame]
         start = time.perf_counter()
         state = jax.block_until_ready(hio.update(state, cloud, pose))
         times_ms.append(1e3 * (time.perf_counter() - start))
@@ -62,7 +63,7 @@ def score_stream(path: Path, config_name: str, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Accuracy on streams.")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--streams", nargs="+", default=["house_depth", "house_lidar"])
     parser.add_argument("--configs", nargs="+", default=["light"])

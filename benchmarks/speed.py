@@ -103,7 +103,7 @@ def stage_times(path: Path, config_name: str, frames: int) -> dict[str, dict[str
 
 def main() -> None:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Time of an update.")
     parser.add_argument("--stream", type=Path, default=Path("../shared/data/house_depth.npz"))
     parser.add_argument("--config", default="light")
     parser.add_argument("--frames", type=int, default=30)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from typing import Any
 
 Point = tuple[float, float, float]
@@ -99,12 +100,12 @@ class Config:
         for name, low, high in _LIMITS:
             value = getattr(self, name)
             kind = Config.__dataclass_fields__[name].type
-            if isinstance(value, bool) or not isinstance(value, int | float):
+            if isinstance(value, bool) or not isinstance(value, numbers.Real):
                 raise ValueError(f"Config.{name} is {value!r}, expected a number")
-            if kind == "int" and value != int(value):
-                raise ValueError(f"Config.{name} is {value!r}, expected a whole number")
             if not low <= value <= high:  # also catches NaN
                 raise ValueError(f"Config.{name} is {value!r}, expected {low} <= {name} <= {high}")
+            if kind == "int" and value != int(value):
+                raise ValueError(f"Config.{name} is {value!r}, expected a whole number")
             object.__setattr__(self, name, int(value) if kind == "int" else float(value))
         if not (self.range_noise[0] > 0 and 0 <= self.range_noise[1] < math.inf):
             raise ValueError(f"Config.range_noise is {noise!r}, expected a > 0 and b >= 0")

@@ -24,8 +24,7 @@ class Flag(enum.IntFlag):
     """A training step gave a value that is not finite: the network was kept as it was."""
 
 
-@flax.struct.dataclass
-class Report:
+class Report(flax.struct.PyTreeNode):
     """Scalars of the last update; `flags` gathers those of all updates.
 
     Attributes:
@@ -47,8 +46,7 @@ class Report:
     flags: jax.Array
 
 
-@flax.struct.dataclass
-class Grid:
+class Grid(flax.struct.PyTreeNode):
     """The coarse global grid: what each voxel remembers of the rays that met it.
 
     Lengths are in voxels; offsets are from the voxel's centre. The first six arrays are evidence,
@@ -78,8 +76,7 @@ class Grid:
     sdf: jax.Array
 
 
-@flax.struct.dataclass
-class Network:
+class Network(flax.struct.PyTreeNode):
     """The SIREN and its optimiser.
 
     Attributes:
@@ -95,8 +92,7 @@ class Network:
     origin_world: jax.Array
 
 
-@flax.struct.dataclass
-class MapState:
+class MapState(flax.struct.PyTreeNode):
     """Everything that an update needs and changes; made by `init`, changed by `update`.
 
     Attributes:
@@ -116,8 +112,7 @@ class MapState:
     report: Report
 
 
-@flax.struct.dataclass
-class Field:
+class Field(flax.struct.PyTreeNode):
     """What a planner holds while the map goes on; made by `snapshot`.
 
     Attributes:

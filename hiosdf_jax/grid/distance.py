@@ -25,6 +25,9 @@ _FREE_RATIO = 0.1
 # How far behind a patch free space makes it a sheet: beyond the margin that passes keep, voxels.
 _SHEET_VOXELS = 2.0
 
+# Voxels whose patches are evaluated together.
+_TILE_VOXELS = 1 << 17
+
 # Shifts that one loop iteration of a pass tries in either direction.
 _CHUNK = 8
 
@@ -43,16 +46,18 @@ def nearest_sites(sites: jax.Array, offset: jax.Array, horizon: int) -> tuple[ja
         squared: (X, Y, Z) squared distance of the voxel's centre to it, voxels^2.
     """
     shape = sites.shape
-    nearest = jnp.arange(sites.size, dtype=jnp.int32).reshape(shape)
-    position = nearest
+    position = jnp.arange(sites.size, dtype=jnp.int32).reshape(shape)
+    nearest = position
     squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
-    flat_offset = offset.reshape(-1, 3)
     # Short axes first: after a floor and a ceiling are known, the others need few shifts.
-    for axis in sorted(range(3), key=lambda k: shape[k]):
+    for count, axis in enumerate(sorted(range(3), key=lambda k: shape[k])):
         stride = [shape[1] * shape[2], shape[2], 1][axis]
-        along = flat_offset[nearest.ravel(), axis].reshape(shape)
+        along = offset[..., axis]
+        if count > 0:  # each voxel's candidate is no longer its own site
+            along = along.ravel()[nearest.ravel()].reshape(shape)
         squared, shift = _pass(squared, along, axis, horizon)
-        nearest = nearest.ravel()[(position + shift * stride).ravel()].reshape(shape)
+        candidate = position + shift * stride
+        nearest = candidate if count == 0 else nearest.ravel()[candidate]
     found = squared <= horizon**2
     return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
 
@@ -124,19 +129,28 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
     mean = mean.astype(jnp.float32)
     features = surface.is_feature(config, hits, passes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels)
-    found = nearest >= 0
+    nearest = nearest.ravel()
+    free = is_free(passes, behind)
+    flat_mean, flat_axes = mean.reshape(-1, 3), axes.reshape(-1, 3, 3)
+    flat_behind = behind.ravel()
 
-    here = jnp.stack(jnp.meshgrid(*(jnp.arange(n) for n in shape), indexing="ij"), axis=-1)
-    site = jnp.stack(jnp.unravel_index(jnp.maximum(nearest, 0), shape), axis=-1)
-    jump = site - here
-    row = jnp.maximum(nearest, 0).ravel()
-    patch_mean = mean.reshape(-1, 3)[row].reshape(*shape, 3) + jump
-    patch_axes = axes.reshape(-1, 3, 3)[row].reshape(*shape, 3, 3).astype(jnp.float32)
-    offset = surface.patch_offset(jnp.zeros(3), patch_mean, patch_axes)
-    distance = surface.safe_norm(offset)
-    side = _side(passes, behind, here, offset, distance, patch_axes)
-    sdf = jnp.where(found, side * distance * config.voxel_size, config.distance_horizon)
-    jump = jnp.where(found[..., None], jump, NO_FEATURE).astype(jnp.int8)
+    def place(voxel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Jump to the nearest patch and signed distance to it, of one voxel of the window."""
+        here = jnp.stack(jnp.unravel_index(voxel, shape))
+        row = jnp.maximum(nearest[voxel], 0)
+        jump = jnp.stack(jnp.unravel_index(row, shape)) - here
+        patch_axes = flat_axes[row].astype(jnp.float32)
+        offset = surface.patch_offset(jnp.zeros(3), flat_mean[row] + jump, patch_axes)
+        distance = surface.safe_norm(offset)
+        side = _side(free, flat_behind[voxel], here, offset, distance, patch_axes)
+        found = nearest[voxel] >= 0
+        sdf = jnp.where(found, side * distance * config.voxel_size, config.distance_horizon)
+        return jnp.where(found, jump, NO_FEATURE).astype(jnp.int8), sdf
+
+    # In tiles: the patches of all voxels at once would take many times the map's memory.
+    tile = min(_TILE_VOXELS, nearest.size)
+    jump, sdf = jax.lax.map(place, jnp.arange(nearest.size), batch_size=tile)
+    jump, sdf = jump.reshape(*shape, 3), sdf.reshape(shape)
 
     inner = geometry.window_shape(config, changed)
     inner_start = geometry.window_start(config, inner, sensor_world)
@@ -163,38 +177,37 @@ def is_free(passes: jax.Array, behind: jax.Array) -> jax.Array:
 
 
 def _side(
-    passes: jax.Array,
+    free: jax.Array,
     behind: jax.Array,
     here: jax.Array,
     offset: jax.Array,
     distance: jax.Array,
     axes: jax.Array,
 ) -> jax.Array:
-    """Sign of each voxel's centre: +1 in free space, -1 behind surfaces.
+    """Sign of a voxel's centre: +1 in free space, -1 behind surfaces.
 
     Away from surfaces the rays through the voxel decide. Within a voxel of a flat patch the side
     of its plane does, since rays end in such a voxel: unless the patch is a sheet, with free space
     behind it as well.
 
     Args:
-        passes: (X, Y, Z) rays that went through the voxel.
-        behind: (X, Y, Z) rays that ended a little before it.
-        here: (X, Y, Z, 3) index of the voxel in these arrays.
-        offset: (X, Y, Z, 3) from the nearest point of the nearest patch to the centre, voxels.
-        distance: (X, Y, Z) its length.
-        axes: (X, Y, Z, 3, 3) of that patch.
+        free: (X, Y, Z) bool, what `is_free` says of the window.
+        behind: () rays that ended a little before the voxel.
+        here: (3,) index of the voxel in the window.
+        offset: (3,) from the nearest point of the nearest patch to the centre, voxels.
+        distance: () its length.
+        axes: (3, 3) of that patch.
 
     Returns:
-        (X, Y, Z) float32.
+        () float32.
     """
-    free = is_free(passes, behind)
     length = surface.safe_norm(axes)
-    flat = length[..., 2] < 0.5 * length[..., 1]
-    normal = axes[..., 2, :] / jnp.maximum(length[..., 2], 1e-6)[..., None]
-    in_front = jnp.sum(offset * normal, axis=-1) >= 0
+    flat = length[2] < 0.5 * length[1]
+    normal = axes[2] / jnp.maximum(length[2], 1e-6)
+    in_front = jnp.dot(offset, normal, precision="highest") >= 0
     probe = jnp.round(here - offset - _SHEET_VOXELS * normal).astype(jnp.int32)
     probe = jnp.clip(probe, 0, jnp.asarray(free.shape) - 1)
-    sheet = free.ravel()[geometry.flat_index(free.shape, probe)]
+    sheet = free[probe[0], probe[1], probe[2]]
     by_plane = in_front | sheet
-    by_rays = free | ((behind == 0) & in_front)
+    by_rays = free[here[0], here[1], here[2]] | ((behind == 0) & in_front)
     return jnp.where(jnp.where(flat & (distance < 1), by_plane, by_rays), 1.0, -1.0)

@@ -54,7 +54,7 @@ def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     return (lattice.astype(jnp.float32) + 0.5) * config.voxel_size
 
 
-def flat_index(shape: tuple[int, int, int], index: jax.Array) -> jax.Array:
+def flat_index(shape: tuple[int, ...], index: jax.Array) -> jax.Array:
     """Turns (..., 3) indices of an array of this shape into (...) indices of its raveled form."""
     return (index[..., 0] * shape[1] + index[..., 1]) * shape[2] + index[..., 2]
 

@@ -63,7 +63,7 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
     Returns:
         (...) m.
     """
-    return siren(config).apply(params, points)
+    return jnp.asarray(siren(config).apply(params, points))
 
 
 def predict_with_gradient(

@@ -1,0 +1,237 @@
+"""The `hiosdf` command: `hiosdf demo`, `hiosdf map STREAM.npz`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+# Nothing heavy is imported up here: `hiosdf --help` answers at once.
+if TYPE_CHECKING:
+    import numpy as np
+
+    from hiosdf_jax.config import Config
+    from hiosdf_jax.datasets import Stream
+
+_NOTHING_MAPPED, _BAD_INPUT = 1, 2  # exit codes; argparse itself exits with 2
+
+
+class _Failure(Exception):
+    """What ends the command with a line on stderr and an exit code."""
+
+    def __init__(self, message: object, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class _First:
+    """The first frames of a stream, as a stream."""
+
+    def __init__(self, stream: Stream, count: int) -> None:
+        self._stream, self._count = stream, min(count, len(stream))
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        if not 0 <= index < self._count:
+            raise IndexError(f"index = {index}, expected 0 <= index < {self._count}")
+        return self._stream[index]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command.
+
+    Args:
+        arguments: Those after the command's name; by default those of the process.
+
+    Returns:
+        The exit code: 0, 1 if no frame could be mapped, 2 if a file or a value is not what it
+        should be.
+
+    Raises:
+        SystemExit: An argument is unknown or malformed, or help was asked for.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        options.command(options)
+    except _Failure as failure:
+        print(f"hiosdf: {failure}", file=sys.stderr)
+        return failure.code
+    return 0
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from hiosdf_jax import demo
+
+    stream = demo.ApartmentStream(frames=options.frames, seed=options.seed)
+    config = _configure(options.config, demo.BOUNDS_WORLD, max_range=stream.max_range)
+    print(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
+    _run(
+        stream,
+        config,
+        options.output,
+        name="demo",
+        seed=options.seed,
+        truth=demo.ground_truth(stream),
+        exact_sdf=lambda points_world: demo.signed_distance(stream.model, points_world)[0],
+    )
+
+
+def _map(options: argparse.Namespace) -> None:
+    from hiosdf_jax import datasets
+
+    if options.save is not None and not options.save.parent.is_dir():
+        raise _Failure(f"{options.save.parent}: no such folder", _BAD_INPUT)
+    stream: Stream = _checked(lambda: datasets.NpzStream(options.stream))
+    truth = _checked(lambda: datasets.ground_truth(options.stream))
+    if options.frames is not None:
+        stream = _First(stream, options.frames)
+    bounds, max_range = options.bounds, options.max_range
+    if bounds is not None:
+        bounds = (tuple(bounds[:3]), tuple(bounds[3:]))
+    if bounds is None or max_range is None:
+        extent = _checked(lambda: datasets.find_bounds(stream), code=_NOTHING_MAPPED)
+        bounds = bounds or extent.bounds
+        max_range = max_range or math.ceil(10 * extent.max_range) / 10
+        (x0, y0, z0), (x1, y1, z1) = bounds
+        print(
+            f"bounds x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}, z {z0:.1f} to {z1:.1f} m; "
+            f"returns up to {max_range:.1f} m"
+        )
+    overrides = {"max_range": max_range}
+    if options.voxel_size is not None:
+        overrides["voxel_size"] = options.voxel_size
+    _run(
+        stream,
+        _configure(options.config, bounds, **overrides),
+        options.output or Path("hiosdf_output") / options.stream.stem,
+        name=options.stream.name,
+        seed=options.seed,
+        truth=truth,
+        save_path=options.save,
+    )
+
+
+def _configure(name: str, bounds: Any, **overrides: float) -> Config:
+    from hiosdf_jax.config import Config
+
+    return _checked(lambda: getattr(Config, name)(bounds, **overrides))
+
+
+def _run(stream: Stream, config: Config, output: Path, **settings: Any) -> None:
+    from hiosdf_jax import run
+
+    try:
+        run.run_stream(stream, config, output, **settings)
+    except run.NothingMappedError as error:
+        raise _Failure(error, _NOTHING_MAPPED) from error
+    except OSError as error:
+        raise _Failure(_told(error), _BAD_INPUT) from error
+
+
+def _checked[Result](call: Callable[[], Result], code: int = _BAD_INPUT) -> Result:
+    """Calls, and makes one line of what is wrong with the input."""
+    try:
+        return call()
+    except (OSError, ValueError) as error:
+        raise _Failure(_told(error), code) from error
+
+
+def _told(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{os.fspath(error.filename)}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="hiosdf", description="Signed distance fields from posed point clouds, online."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument(
+        "--config",
+        choices=("light", "paper", "default"),
+        default="light",
+        help="light is sized for a CPU, default for a GPU, paper has the paper's numbers",
+    )
+    common.add_argument(
+        "--seed", type=_whole(0), default=0, help="of all randomness (default: %(default)s)"
+    )
+
+    demo = commands.add_parser(
+        "demo",
+        parents=[common],
+        help="map a simulated apartment and score the map",
+        description="Maps a simulated, furnished apartment, scores the map against exact "
+        "distances, and draws it.",
+    )
+    demo.add_argument(
+        "--output",
+        type=Path,
+        default=Path("hiosdf_output") / "demo",
+        metavar="DIR",
+        help="folder for metrics and pictures (default: %(default)s)",
+    )
+    demo.add_argument(
+        "--frames",
+        type=_whole(1),
+        default=80,
+        metavar="N",
+        help="frames along the camera's path (default: %(default)s)",
+    )
+    demo.set_defaults(command=_demo)
+
+    map_ = commands.add_parser(
+        "map",
+        parents=[common],
+        help="map a recorded stream",
+        description="Maps a recorded stream, scores the map and draws it. A stream without exact "
+        "distances (eval_*) is scored on frames that the map is not given.",
+    )
+    map_.add_argument(
+        "stream", type=Path, metavar="STREAM.npz", help="see hiosdf_jax/datasets/npz.py"
+    )
+    map_.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder for metrics and pictures (default: hiosdf_output/STREAM)",
+    )
+    map_.add_argument(
+        "--bounds",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="the mapped box, m, world (default: found in a first pass over the stream)",
+    )
+    map_.add_argument("--voxel-size", type=float, metavar="M", help="of the coarse grid")
+    map_.add_argument(
+        "--max-range",
+        type=float,
+        metavar="M",
+        help="farther returns leave no surface (default: found in the first pass)",
+    )
+    map_.add_argument("--frames", type=_whole(1), metavar="N", help="only the first N frames")
+    map_.add_argument("--save", type=Path, metavar="FILE", help="write the map, for hio.load")
+    map_.set_defaults(command=_map)
+    return parser
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    def whole_number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{value}, expected at least {least}")
+        return value
+
+    return whole_number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,394 @@
+"""A stream from end to end: mapped, scored, and drawn into a folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from hiosdf_jax import checkpoint, evaluation, mapping, mesh
+from hiosdf_jax.config import Config
+from hiosdf_jax.datasets.stream import Stream
+from hiosdf_jax.query import query, sdf_and_grad
+from hiosdf_jax.state import Field, Flag, MapState
+
+if TYPE_CHECKING:
+    import trimesh
+
+# Of a stream without ground truth the map is not given every tenth frame, once it has seen some.
+_FIRST_HELD_OUT = 15
+_HOLD_OUT_EVERY = 10
+_HELD_OUT_POINTS = 20_000  # over all these frames
+_RIGID_TOLERANCE = 5e-3  # on R^T R - I, as in an update
+
+# A mesh is sampled about this often, within limits: no finer than anyone can see, no coarser than
+# the grid.
+_MESH_SAMPLES = 4e6
+_MESH_FINEST = 0.025  # m
+
+_LEVEL = np.radians(20)  # a normal nearer than this to upwards is that of a floor or a table
+_TILTED = np.radians(2)  # a world whose z is farther than this from upwards is levelled to draw it
+_MARGIN = 0.2  # m, around what is drawn of it
+_HEADROOM = 2.5  # m above the sensor; rooms are lower, and have little to show up there
+
+_FLAG_WORDS = {
+    Flag.BAD_POSE: "a pose was not finite or not rigid",
+    Flag.EMPTY_CLOUD: "a cloud had no return",
+    Flag.POINTS_OUTSIDE: "points in range fell outside the bounds and left no surface",
+    Flag.TRAINING_FAILED: "a training step was not finite and was undone",
+}
+
+
+class NothingMappedError(Exception):
+    """No frame of a stream could be mapped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mapped:
+    """What mapping a stream gave.
+
+    Attributes:
+        state: The map after the last frame.
+        path_world: (F, 3) m, the sensor's positions in the frames that were mapped.
+        up_world: (3,) unit vector against gravity, as well as the sensor's poses tell.
+        update_seconds: (F,) s, of each update, until its result was there.
+        skipped: Frames that `update` refused.
+        points_used: Points that were fused, over all frames.
+        points_outside: Points in range that lay outside the bounds, over all frames.
+    """
+
+    state: MapState
+    path_world: np.ndarray
+    up_world: np.ndarray
+    update_seconds: np.ndarray
+    skipped: int
+    points_used: int
+    points_outside: int
+
+
+def run_stream(
+    stream: Stream,
+    config: Config,
+    output: str | os.PathLike[str],
+    *,
+    name: str,
+    seed: int = 0,
+    truth: evaluation.GroundTruth | None = None,
+    exact_sdf: Callable[[np.ndarray], np.ndarray] | None = None,
+    save_path: str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
+    """Maps a stream, then writes what came of it into a folder and prints the scores.
+
+    The folder gets `metrics.json`, `slices.png`, `mesh.ply` and `mesh.png`. A stream without
+    ground truth is scored on the returns of every tenth frame, which the map is not given.
+
+    Args:
+        stream: The frames.
+        config: The map's configuration.
+        output: The folder; made if it is not there.
+        name: What the stream is called in `metrics.json`.
+        seed: Of the map's randomness.
+        truth: Exact distances to score against.
+        exact_sdf: Maps (n, 3) points in the world, m, to (n,) exact distances, m; drawn beside the
+            map.
+        save_path: Where to write the map itself, see `hiosdf_jax.load`.
+
+    Returns:
+        What `metrics.json` holds.
+
+    Raises:
+        NothingMappedError: No frame could be mapped.
+        OSError: The folder or a file in it cannot be written.
+    """
+    output = Path(output)
+    output.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    frames = range(len(stream))
+    held_out = frames[_FIRST_HELD_OUT::_HOLD_OUT_EVERY] if truth is None else range(0)
+    mapped = map_frames(
+        stream, [i for i in frames if i not in held_out], config, jax.random.key(seed)
+    )
+    if save_path is not None:
+        checkpoint.save(save_path, mapped.state)
+    field = mapping.snapshot(mapped.state)
+
+    metrics = _describe(mapped, config) | {"stream": name, "seed": seed}
+    if truth is not None:
+        metrics["scores"] = evaluation.evaluate(
+            lambda points: _sdf_and_grad(field, points),
+            truth,
+            sensor_position_world=mapped.path_world[-1],
+            last_frame=len(stream) - 1,
+        )
+    elif held_out:
+        metrics["held_out"] = _score_held_out(field, stream, held_out)
+    print(_summary(metrics))
+
+    print("drawing slices.png, mesh.ply and mesh.png")
+    surface = _extract(field)
+    up_world = level_up(surface, mapped.up_world)
+    metrics["up_world"] = up_world.tolist()
+    _write_mesh(output, surface, up_world)
+    _draw_slices(output / "slices.png", field, exact_sdf, mapped.path_world, surface, up_world)
+    metrics["total_s"] = time.perf_counter() - start
+    (output / "metrics.json").write_text(json.dumps(_plain(metrics), indent=2) + "\n", "utf-8")
+    print(f"wrote {output}{os.sep} in {metrics['total_s']:.0f} s")
+    return metrics
+
+
+def map_frames(stream: Stream, frames: Sequence[int], config: Config, key: jax.Array) -> Mapped:
+    """Maps frames of a stream one by one, with a progress bar.
+
+    A frame that `update` refuses is reported on stderr and passed over.
+
+    Args:
+        stream: The frames.
+        frames: Which of them, in order.
+        config: The map's configuration.
+        key: Source of the map's randomness.
+
+    Returns:
+        The map, and what is known of how it was made.
+
+    Raises:
+        NothingMappedError: No frame could be mapped.
+    """
+    from tqdm import tqdm
+
+    state = mapping.init(config, key)
+    seconds, path_world, ups_world = [], [], []
+    points_used = points_outside = skipped = 0
+    bar = tqdm(frames, desc="mapping", unit="frame")
+    for i in bar:
+        cloud, pose = stream[i]
+        start = time.perf_counter()
+        try:
+            state = jax.block_until_ready(mapping.update(state, cloud, pose))
+        except ValueError as error:
+            skipped += 1
+            message = " ".join(str(error).split())
+            tqdm.write(f"frame {i}: {message}", file=sys.stderr)
+            continue
+        seconds.append(time.perf_counter() - start)
+        path_world.append(pose[:3, 3])
+        ups_world.append(_up_of_frame(cloud, pose))
+        points_used += int(state.report.points_used)
+        points_outside += int(state.report.points_outside)
+        if i % 5 == 0:
+            loss_cm = 100 * float(state.report.sdf_loss)
+            bar.set_postfix_str(
+                f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points", refresh=False
+            )
+    if not seconds:
+        raise NothingMappedError(f"none of the {len(frames)} frames could be mapped")
+    up_world = np.mean(ups_world, axis=0)
+    length = np.linalg.norm(up_world)
+    return Mapped(
+        state=state,
+        path_world=np.asarray(path_world, float),
+        up_world=up_world / length if length > 0.1 else np.array([0.0, 0.0, 1.0]),
+        update_seconds=np.asarray(seconds),
+        skipped=skipped,
+        points_used=points_used,
+        points_outside=points_outside,
+    )
+
+
+def slice_heights(sensor: float, low: float, high: float) -> list[float]:
+    """Chooses where to cut a map: at the sensor's height, half-way down, and in halls half-way up.
+
+    Args:
+        sensor: Height of the sensor, m.
+        low: Height of the floor, m.
+        high: Height of the ceiling, m.
+
+    Returns:
+        One to three heights, m, ascending.
+    """
+    heights = [sensor]
+    if sensor - low >= 0.4:
+        heights.insert(0, (low + sensor) / 2)
+    if high - sensor >= _HEADROOM:
+        heights.append((sensor + high) / 2)
+    return heights
+
+
+def level_up(surface: trimesh.Trimesh, up_world: np.ndarray) -> np.ndarray:
+    """Finds the direction against gravity from floors and tables.
+
+    Args:
+        surface: With normals towards free space.
+        up_world: (3,) unit vector, a first guess.
+
+    Returns:
+        (3,) unit vector; the guess where nothing about level is to be seen.
+    """
+    if not len(surface.faces):
+        return up_world
+    for within in (2 * _LEVEL, _LEVEL, _LEVEL):
+        level = surface.face_normals @ up_world > np.cos(within)
+        total = (surface.area_faces[level, None] * surface.face_normals[level]).sum(axis=0)
+        if total.any():
+            up_world = total / np.linalg.norm(total)
+    return up_world
+
+
+def _up_of_frame(cloud: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """The direction against gravity of a sensor that is carried upright, (3,), world.
+
+    A camera sees only what lies in front of it, along z; its y points down. A LiDAR sees around
+    itself; its z points up.
+    """
+    heights = cloud[np.isfinite(cloud).all(axis=-1), 2]
+    return -pose[:3, 1] if (heights > 0).all() else pose[:3, 2]
+
+
+def _describe(mapped: Mapped, config: Config) -> dict[str, Any]:
+    """What is to be told of a map but for its scores."""
+    # The first update compiles.
+    later_ms = 1000 * mapped.update_seconds[1:]
+    flags = int(mapped.state.report.flags)
+    return {
+        "updates": int(mapped.state.updates),
+        "frames_skipped": mapped.skipped,
+        "compile_s": float(mapped.update_seconds[0]),
+        "update_median_ms": float(np.median(later_ms)) if len(later_ms) else math.nan,
+        "update_p90_ms": float(np.percentile(later_ms, 90)) if len(later_ms) else math.nan,
+        "points_used": mapped.points_used,
+        "points_outside": mapped.points_outside,
+        "flags": [str(flag.name) for flag in Flag if flags & flag],
+        "config": dataclasses.asdict(config),
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def _score_held_out(field: Field, stream: Stream, frames: Sequence[int]) -> dict[str, float]:
+    """Scores a map on returns of frames that it was not given, where it has seen the place."""
+    config, rng = field.config, np.random.default_rng(0)
+    quota = max(_HELD_OUT_POINTS // len(frames), 1)
+    points = [np.empty((0, 3), np.float32)]
+    for i in frames:
+        cloud, pose = stream[i]
+        gram = pose[:3, :3].T @ pose[:3, :3]
+        if not (np.isfinite(pose).all() and np.allclose(gram, np.eye(3), atol=_RIGID_TOLERANCE)):
+            continue
+        ranges = np.linalg.norm(cloud, axis=-1)  # NaN, which compares as False, for no return
+        cloud = cloud[(ranges >= config.min_range) & (ranges <= config.max_range)]
+        cloud = rng.choice(cloud, min(quota, len(cloud)), replace=False)
+        points.append(cloud @ pose[:3, :3].T + pose[:3, 3])
+    points_world = np.concatenate(points)
+    if not len(points_world):
+        return {"points": 0, "points_observed": 0}
+    observed = np.asarray(_observed(field, points_world))  # False outside the bounds
+    scores: dict[str, float] = {"points": len(points_world), "points_observed": int(observed.sum())}
+    if observed.any():
+        scores |= evaluation.held_out_surface(
+            lambda points: _sdf_and_grad(field, points)[0], points_world[observed]
+        )
+    return scores
+
+
+def _summary(metrics: dict[str, Any]) -> str:
+    """Lays out for a terminal what a run gave."""
+    lines = [
+        f"{metrics['updates']} updates on {metrics['device']}: "
+        f"first {metrics['compile_s']:.1f} s (it compiles), then "
+        f"{metrics['update_median_ms']:.0f} ms (median), "
+        f"{metrics['update_p90_ms']:.0f} ms (90 % below)"
+    ]
+    if metrics["frames_skipped"]:
+        lines.append(f"{metrics['frames_skipped']} frames could not be used and were passed over")
+    for flag in metrics["flags"]:
+        words = _FLAG_WORDS[Flag[flag]]
+        if flag == Flag.POINTS_OUTSIDE.name:
+            outside = metrics["points_outside"]
+            words += f" ({outside} of {outside + metrics['points_used']})"
+        lines.append(f"flag {flag}: {words}")
+    scores = metrics.get("scores") or metrics.get("held_out")
+    if scores:
+        lines += ["", evaluation.format_table(scores), ""]
+    return "\n".join(lines)
+
+
+def _draw_slices(
+    file: Path,
+    field: Field,
+    exact_sdf: Callable[[np.ndarray], np.ndarray] | None,
+    path_world: np.ndarray,
+    surface: trimesh.Trimesh,
+    up_world: np.ndarray,
+) -> None:
+    """Draws level slices: in the world, or if that is tilted in a frame turned to be upright."""
+    from hiosdf_jax import view
+
+    bounds: Sequence[Sequence[float]] = field.config.bounds
+    tilted = up_world[2] < np.cos(_TILTED)
+    world_from_level = _turn_to(up_world) if tilted else np.eye(3)
+    path = path_world @ world_from_level
+    solid = np.asarray(surface.vertices if len(surface.faces) else bounds) @ world_from_level
+    if tilted:
+        print("the world's z is not upwards: slices.png is in a frame turned to be level")
+        corners = np.concatenate([solid, path])
+        bounds = np.stack([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]).tolist()
+    low, high = np.percentile(solid[:, 2], [2, 98])  # floor and ceiling, but for specks
+    turn = world_from_level.T.astype(np.float32)  # of rows
+    view.save_slices(
+        file,
+        lambda points: _sdf_and_grad(field, points @ turn)[0],
+        None if exact_sdf is None else lambda points: exact_sdf(points @ turn),
+        bounds,
+        slice_heights(float(np.median(path[:, 2])), float(low), float(high)),
+        path_world=path,
+        observed=lambda points: _observed(field, points @ turn),
+    )
+
+
+def _turn_to(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation that takes z to a unit vector, (3, 3)."""
+    if up[2] < -1 + 1e-6:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = up
+    skew = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + z)
+
+
+def _extract(field: Field) -> trimesh.Trimesh:
+    low, high = np.asarray(field.config.bounds)
+    spacing = max(float(np.cbrt(np.prod(high - low) / _MESH_SAMPLES)), _MESH_FINEST)
+    return mesh.extract_mesh(field, min(spacing, field.config.voxel_size))
+
+
+def _write_mesh(output: Path, surface: trimesh.Trimesh, up_world: np.ndarray) -> None:
+    from hiosdf_jax import view
+
+    model, picture = output / "mesh.ply", output / "mesh.png"
+    if not len(surface.faces):
+        print("the map shows no surface: no mesh.ply, no mesh.png")
+        for path in (model, picture):  # of an earlier run
+            path.unlink(missing_ok=True)
+        return
+    surface.export(model)
+    view.save_shaded(picture, surface, up_world=up_world.tolist())
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: it has neither NaN nor tuples."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# The map is an argument, so that these compile once for maps of one configuration.
+_sdf_and_grad = jax.jit(sdf_and_grad)
+_observed = jax.jit(lambda field, points: query(field, points).observed)

@@ -1,0 +1,335 @@
+"""The command, run as a user would on small streams; what it writes, says and answers."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from matplotlib.image import imread
+
+import hiosdf_jax as hio
+from hiosdf_jax import cli, run
+
+# A room without furniture; the sensor walks round in it.
+LOW, HIGH = np.array([-1.2, -1.0, 0.0]), np.array([1.2, 1.0, 1.6])
+BOX = ["--bounds", "-1.4", "-1.2", "-0.2", "1.4", "1.2", "1.8", "--max-range", "3"]
+OUTPUTS = {"metrics.json", "slices.png", "mesh.ply", "mesh.png"}
+
+
+def positions(frames):
+    angle = 0.3 * np.arange(frames)
+    return np.stack([0.4 * np.cos(angle), 0.3 * np.sin(angle), np.full(frames, 0.9)], axis=1)
+
+
+def cast(origin, directions_world):
+    """Distance along each ray to the walls of the room, (N,)."""
+    with np.errstate(divide="ignore"):
+        return np.where(
+            directions_world > 0,
+            (HIGH - origin) / directions_world,
+            (LOW - origin) / directions_world,
+        ).min(axis=-1)
+
+
+def wall_sdf(points):
+    gaps = np.concatenate([points - LOW, HIGH - points], axis=-1)
+    nearest = gaps.argmin(axis=-1)
+    return gaps.min(axis=-1), np.concatenate([np.eye(3), -np.eye(3)])[nearest]
+
+
+def beams(count):
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def scan(frames):
+    """Ranges (F, 600) of a LiDAR, its directions and its poses."""
+    directions = beams(600)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, 3] = positions(frames)
+    return np.stack([cast(pose[:3, 3], directions) for pose in poses]), directions, poses
+
+
+def write_range(path, frames, truth=True):
+    ranges, directions, poses = scan(frames)
+    arrays = {"poses": poses, "range": ranges, "directions": directions, "range_scale": 1.0}
+    if truth:
+        rng = np.random.default_rng(1)
+        share = rng.uniform(size=(500, 1))
+        frame = rng.integers(0, frames, 500)
+        beam = rng.integers(0, 600, 500)
+        hits = poses[frame, :3, 3] + ranges[frame, beam, None] * directions[beam]
+        points = poses[frame, :3, 3] + share * (hits - poses[frame, :3, 3])
+        sdf, grad = wall_sdf(points)
+        arrays |= {"eval_visible": points, "eval_visible_sdf": sdf, "eval_visible_grad": grad}
+        arrays |= {"eval_visible_frame": frame, "eval_surface": hits}
+    np.savez(path, **arrays)
+    return path
+
+
+def write_points(path, frames, empty=(), bad=()):
+    ranges, directions, poses = scan(frames)
+    scans = [
+        np.zeros((0, 3)) if i in empty else r[:, None] * directions for i, r in enumerate(ranges)
+    ]
+    poses[list(bad), 0, 0] = np.nan
+    offsets = np.cumsum([0, *map(len, scans)])
+    np.savez(
+        path,
+        poses=poses,
+        points_mm=np.rint(1000 * np.concatenate(scans)).astype(np.int16),
+        offsets=offsets,
+    )
+    return path
+
+
+def write_depth(path, frames):
+    """A camera that turns round, in a world whose y points down, as that of a camera's first pose."""
+    height, width, focal = 24, 32, 14.0
+    v, u = np.indices((height, width))
+    rays = np.stack([(u - 15.5) / focal, (v - 11.5) / focal, np.ones_like(u)], -1).reshape(-1, 3)
+    poses, depth = [], []
+    tilted_from_room = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    for i, position in enumerate(positions(frames)):
+        yaw = 0.6 * i
+        right = [np.sin(yaw), -np.cos(yaw), 0]
+        forward = [np.cos(yaw), np.sin(yaw), 0]
+        rotation = np.stack([right, [0, 0, -1], forward], axis=1)
+        depth.append(cast(position, rays @ rotation.T).reshape(height, width))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = tilted_from_room @ rotation, tilted_from_room @ position
+        poses.append(pose)
+    matrix = [[focal, 0, 15.5], [0, focal, 11.5], [0, 0, 1]]
+    raw = np.rint(1000 * np.stack(depth)).astype(np.uint16)
+    np.savez(path, poses=poses, depth=raw, K=np.array(matrix), depth_scale=1000.0)
+    return path
+
+
+def metrics_of(folder):
+    return json.loads((folder / "metrics.json").read_text("utf-8"))
+
+
+def check_pictures(folder):
+    assert {path.name for path in folder.iterdir()} == OUTPUTS
+    for name in ("slices.png", "mesh.png"):
+        picture = imread(folder / name)[..., :3]
+        assert min(picture.shape[:2]) > 400
+        assert picture.std() > 0.05  # something is on it
+
+
+def test_map_with_ground_truth(tmp_path, capsys):
+    stream = write_range(tmp_path / "room.npz", 6)
+    output = tmp_path / "deep" / "out"
+    assert cli.main(["map", str(stream), "--output", str(output), "--seed", "3", *BOX]) == 0
+    check_pictures(output)
+    metrics = metrics_of(output)
+    assert (metrics["stream"], metrics["seed"], metrics["updates"]) == ("room.npz", 3, 6)
+    assert metrics["frames_skipped"] == 0
+    assert metrics["points_used"] == 6 * 600
+    assert metrics["flags"] == []
+    assert metrics["config"]["max_range"] == 3
+    assert hio.Config(**metrics["config"]).bounds == ((-1.4, -1.2, -0.2), (1.4, 1.2, 1.8))
+    assert 0 < metrics["update_median_ms"] <= metrics["update_p90_ms"]
+    assert metrics["compile_s"] > metrics["update_p90_ms"] / 1000
+    scores = metrics["scores"]
+    assert scores["visible_cm"] < 6
+    assert scores["within_3m_cm"] == pytest.approx(scores["visible_cm"])  # the room is that small
+    vertices = np.asarray(trimesh.load(output / "mesh.ply").vertices)
+    assert np.median(np.abs(wall_sdf(vertices)[0])) < 0.06
+    text = capsys.readouterr()
+    assert "error, visible region" in text.out
+    assert f"{scores['visible_cm']:.2f}" in text.out
+    assert "mapping: 100%" in text.err
+
+
+def test_map_only_the_first_frames(tmp_path, capsys):
+    """And bad ones among them are told and passed over."""
+    stream = write_points(tmp_path / "scans.npz", 8, empty=[2], bad=[4])
+    arguments = ["map", str(stream), "--output", str(tmp_path / "out"), "--frames", "6"]
+    assert cli.main([*arguments, *BOX]) == 0
+    metrics = metrics_of(tmp_path / "out")
+    assert (metrics["updates"], metrics["frames_skipped"]) == (4, 2)
+    text = capsys.readouterr()
+    assert "frame 2: cloud has no finite row" in text.err
+    assert "frame 4: pose has values that are not finite" in text.err
+    assert "2 frames could not be used" in text.out
+
+
+def test_map_without_ground_truth_in_a_tilted_world(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stream = write_depth(tmp_path / "turning.npz", 20)
+    saved = tmp_path / "map.npz"
+    arguments = ["map", str(stream), "--voxel-size", "0.08", "--save", str(saved)]
+    assert cli.main(arguments) == 0
+    output = tmp_path / "hiosdf_output" / "turning"
+    check_pictures(output)
+    metrics = metrics_of(output)
+    assert metrics["updates"] == 19  # all but frame 15
+    assert "scores" not in metrics
+    assert metrics["held_out"]["points"] == 24 * 32
+    assert metrics["held_out"]["points_observed"] > 600
+    assert metrics["held_out"]["median_cm"] < 4
+    assert metrics["config"]["voxel_size"] == 0.08
+    assert 1.5 < metrics["config"]["max_range"] < 3
+    np.testing.assert_allclose(metrics["up_world"], [0, -1, 0], atol=0.1)
+    low, high = metrics["config"]["bounds"]
+    np.testing.assert_allclose(low, [-1.5, -1.9, -1.3], atol=0.02)  # with a margin of 0.3 m
+    np.testing.assert_allclose(high, [1.5, 0.3, 1.3], atol=0.02)
+    text = capsys.readouterr()
+    assert "held-out returns, median" in text.out
+    assert "turned to be level" in text.out
+    state = hio.load(saved)
+    assert int(state.updates) == 19
+
+
+def test_points_outside_are_told_in_words(tmp_path, capsys):
+    stream = write_range(tmp_path / "room.npz", 2, truth=False)
+    box = ["--bounds", "-1.4", "-1.2", "-0.2", "1.4", "1.2", "1.4", "--max-range", "3"]
+    assert cli.main(["map", str(stream), "--output", str(tmp_path / "out"), *box]) == 0
+    metrics = metrics_of(tmp_path / "out")
+    assert metrics["flags"] == ["POINTS_OUTSIDE"]
+    assert metrics["points_outside"] > 0
+    assert metrics["points_used"] + metrics["points_outside"] == 2 * 600
+    assert "held_out" not in metrics  # too short to keep anything back
+    expected = f"fell outside the bounds and left no surface ({metrics['points_outside']} of 1200)"
+    assert expected in capsys.readouterr().out
+
+
+def test_no_usable_frame(tmp_path, capsys):
+    stream = write_points(tmp_path / "scans.npz", 2, bad=[0, 1])
+    arguments = ["map", str(stream), "--output", str(tmp_path / "out")]
+    assert cli.main([*arguments, *BOX]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1] == "hiosdf: none of the 2 frames could be mapped"
+    assert cli.main(arguments) == 1  # nor can bounds be found
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "hiosdf: none of the 2 frames has a return and a rigid pose"
+
+
+def broken(tmp_path, kind):
+    path = tmp_path / "stream.npz"
+    if kind == "text":
+        path.write_text("not a zip file")
+    elif kind == "keys":
+        np.savez(path, poses=np.eye(4)[None], depth=np.ones((1, 2, 2)))
+    elif kind == "truth":
+        arrays = dict(np.load(write_range(path, 2)))
+        np.savez(path, **(arrays | {"eval_visible_sdf": np.ones(3)}))
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "good":
+        write_range(path, 2)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        ("missing", [], "{stream}: No such file or directory"),
+        ("folder", [], "{stream}: Is a directory"),
+        ("text", [], "{stream}: not a readable npz file"),
+        ("keys", [], "{stream}: key 'K' is missing"),
+        ("truth", [], "{stream}: eval_visible_sdf has shape (3,), expected (500,)"),
+        (
+            "good",
+            ["--bounds", *"123023", "--max-range", "3"],
+            "Config.bounds has x from 1.0 to 0.0",
+        ),
+        ("good", ["--voxel-size", "0"], "Config.voxel_size is 0.0, expected 0.001 <="),
+        ("good", ["--save", "{folder}/none/map.npz"], "{folder}/none: no such folder"),
+        ("good", ["--output", "{stream}", *BOX], "{stream}: File exists"),
+    ],
+)
+def test_bad_input(tmp_path, capsys, kind, arguments, message):
+    names = {"stream": str(broken(tmp_path, kind)), "folder": str(tmp_path)}
+    arguments = [argument.format(**names) for argument in arguments]
+    assert cli.main(["map", names["stream"], *arguments]) == 2
+    text = capsys.readouterr().err
+    last = text.splitlines()[-1]
+    assert last.startswith("hiosdf: " + message.format(**names))
+    assert "Traceback" not in text
+    if kind != "good":  # nothing came before it
+        assert text.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["demo", "--frames", "0"],
+        ["demo", "--config", "heavy"],
+        ["demo", "--seed", "-1"],
+    ],
+)
+def test_bad_arguments(capsys, arguments):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2
+    assert "usage: hiosdf" in capsys.readouterr().err
+
+
+def test_help():
+    result = subprocess.run(
+        [sys.executable, "-m", "hiosdf_jax.cli", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "demo" in result.stdout
+    assert "map" in result.stdout
+
+
+def test_demo(tmp_path, capsys):
+    output = tmp_path / "demo"
+    assert cli.main(["demo", "--output", str(output), "--frames", "3", "--config", "light"]) == 0
+    check_pictures(output)
+    metrics = metrics_of(output)
+    assert (metrics["stream"], metrics["updates"]) == ("demo", 3)
+    assert set(metrics["scores"]) >= {
+        "visible_cm",
+        "within_3m_cm",
+        "eikonal",
+        "cosine",
+        "recall",
+        "fpr",
+    }
+    assert metrics["scores"]["visible_cm"] < 30  # three frames are few
+    assert "collisions found" in capsys.readouterr().out
+    picture = imread(output / "slices.png")
+    assert picture.shape[1] > 1.3 * picture.shape[0]  # map, truth and error side by side
+
+
+def test_slice_heights():
+    assert run.slice_heights(1.2, 0.0, 2.6) == [0.6, 1.2]
+    assert run.slice_heights(1.0, 0.0, 9.0) == [0.5, 1.0, 5.0]
+    assert run.slice_heights(0.3, 0.0, 1.0) == [0.3]
+
+
+def test_level_up():
+    room = trimesh.creation.box(HIGH - LOW)
+    room.invert()  # free space is inside
+    turn = trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])
+    room.apply_transform(turn)
+    up = turn[:3, 2]
+    guess = up + [0.3, -0.1, 0.1]
+    np.testing.assert_allclose(run.level_up(room, guess / np.linalg.norm(guess)), up, atol=1e-6)
+    np.testing.assert_array_equal(run.level_up(trimesh.Trimesh(), up), up)
+
+
+def test_no_surface_leaves_no_old_mesh(tmp_path, capsys):
+    for name in ("mesh.ply", "mesh.png"):
+        (tmp_path / name).write_text("of an earlier run")
+    run._write_mesh(tmp_path, trimesh.Trimesh(), np.array([0.0, 0, 1]))
+    assert not list(tmp_path.iterdir())
+    assert "no surface" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0.6, 0, -0.8], [0, 0, -1]])
+def test_turn_to(up):
+    turn = run._turn_to(np.array(up, float))
+    np.testing.assert_allclose(turn @ [0, 0, 1], up, atol=1e-12)
+    np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)

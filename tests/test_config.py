@@ -1,0 +1,113 @@
+"""Every field of the configuration is checked, and the lattice follows from the bounds."""
+
+import dataclasses
+import math
+
+import pytest
+
+import hiosdf_jax as hio
+from hiosdf_jax.config import _LIMITS
+
+BOUNDS = ((0, 0, 0), (2, 2, 2))
+
+
+def test_the_paper_s_numbers():
+    config = hio.Config.paper(BOUNDS)
+    expected = {
+        "voxel_size": 0.1,
+        "max_points": 50_000,
+        "near_samples": 10_000,
+        "far_samples": 30_000,
+        "near_distance": 0.05,
+        "local_points": 1000,
+        "local_ray_samples": 20,
+        "local_truncation": 0.2,
+        "local_max_range": 6.0,
+        "hidden_width": 256,
+        "hidden_layers": 4,
+        "frequency": 10.0,
+        "sdf_weight": 5.0,
+        "eikonal_weight": 2.0,
+        "eikonal_every": 1,
+        "learning_rate": 4e-4,
+        "weight_decay": 0.012,
+        "epochs": 10,
+        "batches": 1,
+        "warmup_epochs": 50,
+        "warmup_updates": 5,
+    }
+    assert {name: getattr(config, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize("name, low, high", _LIMITS)
+def test_limits_are_named(name, low, high):
+    for value in (low - 1, high * 2 + 1, math.nan, math.inf):
+        with pytest.raises(ValueError, match=rf"Config\.{name} is .*, expected"):
+            hio.Config.paper(BOUNDS, **{name: value})
+    for value in (True, "3", None):
+        with pytest.raises(ValueError, match=rf"Config\.{name} is .*, expected a number"):
+            hio.Config.paper(BOUNDS, **{name: value})
+    if hio.Config.__dataclass_fields__[name].type == "int":
+        with pytest.raises(ValueError, match=rf"Config\.{name} is 2.5, expected a whole number"):
+            hio.Config.paper(BOUNDS, **{name: 2.5})
+
+
+def test_every_number_has_limits():
+    limited = {name for name, _, _ in _LIMITS} | {"bounds", "range_noise"}
+    assert limited == {field.name for field in dataclasses.fields(hio.Config)}
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        None,
+        3,
+        (0, 0, 0),
+        ((0, 0), (1, 1)),
+        ((0, 0, 0), (1, 1, math.nan)),
+        ((0, 0, 0), (1, 0, 1)),
+        ((0, 0, 0), (1, math.inf, 1)),
+        (("a", 0, 0), (1, 1, 1)),
+    ],
+)
+def test_bad_bounds(bounds):
+    with pytest.raises(ValueError, match=r"Config\.bounds"):
+        hio.Config.light(bounds)
+
+
+def test_what_limits_together_forbid():
+    with pytest.raises(ValueError, match=r"Config\.max_range is 0.05, expected more than min"):
+        hio.Config.paper(BOUNDS, max_range=0.05)
+    with pytest.raises(ValueError, match="at most 127 voxels"):
+        hio.Config.paper(BOUNDS, voxel_size=0.01, distance_horizon=2.0)
+    with pytest.raises(ValueError, match=r"Config\.range_noise"):
+        hio.Config.paper(BOUNDS, range_noise=(0, 1))
+    with pytest.raises(ValueError, match=r"Config\.range_noise"):
+        hio.Config.paper(BOUNDS, range_noise=3)
+    with pytest.raises(ValueError, match=r"expected fewer than 2\^31"):
+        hio.Config.paper(((0, 0, 0), (1e3, 1e3, 1e3)))
+    with pytest.raises(ValueError, match="no field 'voxelsize'"):
+        hio.Config.light(BOUNDS, voxelsize=0.1)
+
+
+def test_frozen_hashable_and_equal():
+    a, b = hio.Config.light(BOUNDS), hio.Config.light(((0.0, 0.0, 0.0), [2, 2, 2]))
+    assert a == b
+    assert hash(a) == hash(b)
+    assert a != hio.Config.paper(BOUNDS)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        a.voxel_size = 1.0
+
+
+@pytest.mark.parametrize(
+    "low, high, corner, shape",
+    [
+        ((0, 0, 0), (0.3, 0.6, 0.7), (0, 0, 0), (3, 6, 7)),
+        ((-0.3, -0.05, 0.1), (0.3, 0.05, 0.2), (-3, -1, 1), (6, 2, 1)),
+        ((0.14, 0.15, 0.16), (0.21, 0.29, 0.31), (1, 1, 1), (2, 2, 3)),
+    ],
+)
+def test_the_grid_covers_the_bounds_with_whole_voxels(low, high, corner, shape):
+    config = hio.Config.light((low, high))
+    assert config.corner_index == corner
+    assert config.grid_shape == shape

@@ -1,0 +1,175 @@
+"""The sine, the SIREN and its training against plain numpy in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hiosdf_jax as hio
+from hiosdf_jax.network import siren, training
+from hiosdf_jax.network.sine import cosine, sine
+from hiosdf_jax.samples import Samples
+
+BOUNDS = ((-1, -1, -1), (1, 1, 1))
+TINY = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, batches=1, eikonal_every=1)
+
+
+def numpy_forward(config, params, points):
+    layers = [params["params"][f"Dense_{k}"] for k in range(config.hidden_layers + 2)]
+    x = np.asarray(points, np.float64)
+    for layer in layers[:-1]:
+        z = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+        x = np.sin(config.frequency * z)
+    last = layers[-1]
+    return (x @ np.asarray(last["kernel"], np.float64) + np.asarray(last["bias"], np.float64))[:, 0]
+
+
+def numpy_gradient(config, params, points, step=1e-5):
+    points = np.asarray(points, np.float64)
+    return np.stack(
+        [
+            (
+                numpy_forward(config, params, points + step * axis)
+                - numpy_forward(config, params, points - step * axis)
+            )
+            / (2 * step)
+            for axis in np.eye(3)
+        ],
+        axis=-1,
+    )
+
+
+def some_samples(count=64, seed=0):
+    points = np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
+    return Samples(
+        jnp.asarray(points),
+        jnp.asarray(0.5 - np.linalg.norm(points, axis=1), jnp.float32),
+        jnp.asarray(np.arange(count) % 5 > 0, jnp.float32),
+    )
+
+
+def train(config, network, samples, epochs, average=0.0, seed=0):
+    return training.train(
+        config, network, samples, jnp.int32(epochs), jnp.float32(average), jax.random.key(seed)
+    )
+
+
+def test_sine_and_its_derivatives():
+    x = np.linspace(-10, 10, 20_001, dtype=np.float32)
+    exact = x.astype(np.float64)
+    assert np.abs(sine(x) - np.sin(exact)).max() < 1e-6
+    assert np.abs(cosine(x) - np.cos(exact)).max() < 1e-6
+    first = jax.vmap(jax.grad(sine))(x)
+    second = jax.vmap(jax.grad(jax.grad(sine)))(x)
+    assert np.abs(first - np.cos(exact)).max() < 1e-6
+    assert np.abs(second + np.sin(exact)).max() < 1e-6
+    far = np.linspace(-300, 300, 10_001, dtype=np.float32)
+    assert np.abs(sine(far) - np.sin(far.astype(np.float64))).max() < 3e-5
+    np.testing.assert_allclose(jax.jit(sine)(x), sine(x), atol=3e-7)
+
+
+def test_the_paper_s_network():
+    config = hio.Config.paper(BOUNDS)
+    params = siren.init_params(config, jax.random.key(0))
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 264_449
+    for k, inputs in enumerate([3, 256, 256, 256, 256, 256]):
+        layer = params["params"][f"Dense_{k}"]
+        bound = (6 / inputs) ** 0.5 / 10
+        for leaf in jax.tree.leaves(layer):
+            assert np.abs(leaf).max() <= bound
+        kernel = np.asarray(layer["kernel"])
+        np.testing.assert_allclose(kernel.std(), bound / 3**0.5, rtol=0.1)
+    points = np.random.default_rng(1).uniform(-5, 5, (50, 3)).astype(np.float32)
+    value, gradient = siren.predict_with_gradient(config, params, points)
+    np.testing.assert_allclose(value, numpy_forward(config, params, points), atol=2e-5)
+    np.testing.assert_allclose(gradient, numpy_gradient(config, params, points), atol=2e-4)
+
+
+@pytest.mark.parametrize("rows", [32_769, 40_000])
+def test_eager_equals_jit_equals_vmap(rows):
+    params = siren.init_params(TINY, jax.random.key(0))
+    points = np.random.default_rng(2).uniform(-1, 1, (rows, 3)).astype(np.float32)
+    eager = siren.predict_with_gradient(TINY, params, points)
+    jitted = jax.jit(lambda p, x: siren.predict_with_gradient(TINY, p, x))(params, points)
+    single = jax.jit(jax.vmap(lambda x: siren.predict_with_gradient(TINY, params, x)))(points)
+    for other in (jitted, single):
+        np.testing.assert_allclose(other[0], eager[0], atol=1e-5)
+        np.testing.assert_allclose(other[1], eager[1], atol=1e-4)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_losses_are_equations_4_and_5(every):
+    config = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, eikonal_every=every)
+    params, samples = siren.init_params(config, jax.random.key(0)), some_samples()
+    result = training.losses(config, params, samples.points_world, samples)
+    used = np.asarray(samples.weight) > 0
+    value = numpy_forward(config, params, samples.points_world)
+    slope = np.linalg.norm(numpy_gradient(config, params, samples.points_world), axis=1)
+    np.testing.assert_allclose(result.sdf, np.abs(value - samples.sdf)[used].mean(), rtol=1e-4)
+    chosen = np.arange(64) % every == 0
+    np.testing.assert_allclose(result.eikonal, np.abs(slope - 1)[used & chosen].mean(), rtol=1e-3)
+
+
+def test_one_step_is_adamw_on_equation_3():
+    network = training.init_network(TINY, jax.random.key(0))
+    samples = some_samples()
+    trained, _, finite = train(TINY, network, samples, 1)
+    assert bool(finite)
+    points = samples.points_world - network.origin_world
+
+    def objective(params):
+        parts = training.losses(TINY, params, points, samples)
+        return TINY.sdf_weight * parts.sdf + TINY.eikonal_weight * parts.eikonal
+
+    gradients = jax.grad(objective)(network.params)
+    # The first step of Adam is lr * g / (|g| + eps), after the decay of the weights (AdamW).
+    for new, old, g in zip(
+        *(jax.tree.leaves(tree) for tree in (trained.params, network.params, gradients)),
+        strict=True,
+    ):
+        g, old = np.asarray(g, np.float64), np.asarray(old, np.float64)
+        step = g / (np.abs(g) + 1e-8) + TINY.weight_decay * old
+        np.testing.assert_allclose(new, old - TINY.learning_rate * step, atol=2e-6)
+
+
+def test_training_fits_and_serves_without_a_bias():
+    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples(256)
+    first = train(TINY, network, samples, 1)[1]
+    trained, last, _ = jax.jit(lambda n, s: train(TINY, n, s, 400))(network, samples)
+    assert float(last.sdf) < 0.2 * float(first.sdf)
+    points = samples.points_world - trained.origin_world
+    residual = siren.predict(TINY, trained.served, points) - samples.sdf
+    assert abs(np.median(np.asarray(residual)[np.asarray(samples.weight) > 0])) < 1e-6
+
+
+def test_epochs_and_batches_are_honoured():
+    config = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, batches=3)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(64)
+    trained, *_ = train(config, network, samples, 4)
+    assert int(trained.optimizer[0].count) == 12
+    parts = training._split(config, samples, jax.random.key(1))
+    assert parts.points_world.shape == (3, 21, 3)
+    rows = np.asarray(parts.points_world).reshape(-1, 3)
+    assert len(np.unique(rows, axis=0)) == 63
+    original = {tuple(row): s for row, s in zip(*map(np.asarray, samples[:2]), strict=True)}
+    flat = np.asarray(parts.sdf).ravel()
+    assert all(original[tuple(row)] == s for row, s in zip(rows, flat, strict=True))
+
+
+def test_the_average_is_of_old_and_new_weights():
+    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples()
+    trained, *_ = train(TINY, network, samples, 5, average=0.75)
+    old, new, served = (
+        np.asarray(tree["params"]["Dense_0"]["kernel"])
+        for tree in (network.served, trained.params, trained.served)
+    )
+    np.testing.assert_allclose(served, 0.75 * old + 0.25 * new, atol=1e-6)
+
+
+def test_a_sample_that_is_not_finite_leaves_the_network_as_it_was():
+    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples()
+    broken = samples._replace(sdf=samples.sdf.at[7].set(jnp.nan))
+    after, _, finite = train(TINY, network, broken, 3)
+    assert not bool(finite)
+    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(network), strict=True):
+        np.testing.assert_array_equal(a, b)
