@@ -99,14 +99,15 @@ class Config:
         object.__setattr__(self, "range_noise", tuple(float(value) for value in noise))
         for name, low, high in _LIMITS:
             value = getattr(self, name)
-            kind = Config.__dataclass_fields__[name].type
+            whole = Config.__dataclass_fields__[name].type == "int"
             if isinstance(value, bool) or not isinstance(value, numbers.Real):
                 raise ValueError(f"Config.{name} is {value!r}, expected a number")
-            if not low <= value <= high:  # also catches NaN
+            number = float(value)
+            if not low <= number <= high:  # also catches NaN
                 raise ValueError(f"Config.{name} is {value!r}, expected {low} <= {name} <= {high}")
-            if kind == "int" and value != int(value):
+            if whole and not number.is_integer():
                 raise ValueError(f"Config.{name} is {value!r}, expected a whole number")
-            object.__setattr__(self, name, int(value) if kind == "int" else float(value))
+            object.__setattr__(self, name, int(number) if whole else number)
         if not (self.range_noise[0] > 0 and 0 <= self.range_noise[1] < math.inf):
             raise ValueError(f"Config.range_noise is {noise!r}, expected a > 0 and b >= 0")
         if self.max_range <= self.min_range:
