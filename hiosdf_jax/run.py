@@ -35,7 +35,7 @@ _RIGID_TOLERANCE = 5e-3  # on R^T R - I, as in an update
 _MESH_SAMPLES = 4e6
 _MESH_FINEST = 0.025  # m
 
-_LEVEL = np.radians(20)  # a normal nearer than this to upwards is that of a floor or a table
+_LEVEL = np.radians(10)  # a normal nearer than this to upwards is that of a floor or a table
 _TILTED = np.radians(2)  # a world whose z is farther than this from upwards is levelled to draw it
 _MARGIN = 0.2  # m, around what is drawn of it
 _HEADROOM = 2.5  # m above the sensor; rooms are lower, and have little to show up there
@@ -234,7 +234,7 @@ def level_up(surface: trimesh.Trimesh, up_world: np.ndarray) -> np.ndarray:
     """
     if not len(surface.faces):
         return up_world
-    for within in (2 * _LEVEL, _LEVEL, _LEVEL):
+    for within in (4 * _LEVEL, 2 * _LEVEL, _LEVEL):
         level = surface.face_normals @ up_world > np.cos(within)
         total = (surface.area_faces[level, None] * surface.face_normals[level]).sum(axis=0)
         if total.any():
