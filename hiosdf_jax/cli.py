@@ -1,4 +1,4 @@
-"""The `hiosdf` command: `hiosdf demo`, `hiosdf map STREAM.npz`."""
+"""The `hiosdf` command: `hiosdf demo`, `hiosdf map STREAM`."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hiosdf_jax.datasets import Stream
 
 _NOTHING_MAPPED, _BAD_INPUT = 1, 2  # exit codes; argparse itself exits with 2
+_SKIP_HINT = " (--skip-bad-frames goes on without such frames)"
 
 
 class _Failure(Exception):
@@ -50,8 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Those after the command's name; by default those of the process.
 
     Returns:
-        The exit code: 0, 1 if no frame could be mapped, 2 if a file or a value is not what it
-        should be.
+        The exit code: 0, 1 if no frame could be mapped, 2 if a file, a frame or a value is not
+        what it should be.
 
     Raises:
         SystemExit: An argument is unknown or malformed, or help was asked for.
@@ -87,15 +88,23 @@ def _map(options: argparse.Namespace) -> None:
 
     if options.save is not None and not options.save.parent.is_dir():
         raise _Failure(f"{options.save.parent}: no such folder", _BAD_INPUT)
-    stream: Stream = _checked(lambda: datasets.NpzStream(options.stream))
-    truth = _checked(lambda: datasets.ground_truth(options.stream))
+    names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
+    chosen = {name: getattr(options, name) for name in names}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    stream = _checked(lambda: datasets.open_stream(options.stream, options.format, **chosen))
+    truth = None
+    if isinstance(stream, datasets.NpzStream):
+        truth = _checked(lambda: datasets.ground_truth(options.stream))
     if options.frames is not None:
         stream = _First(stream, options.frames)
     bounds, max_range = options.bounds, options.max_range
     if bounds is not None:
         bounds = (tuple(bounds[:3]), tuple(bounds[3:]))
     if bounds is None or max_range is None:
-        extent = _checked(lambda: datasets.find_bounds(stream), code=_NOTHING_MAPPED)
+        extent = _checked(
+            lambda: datasets.find_bounds(stream, skip_bad_frames=options.skip_bad_frames),
+            code=_NOTHING_MAPPED,
+        )
         bounds = bounds or extent.bounds
         max_range = max_range or math.ceil(10 * extent.max_range) / 10
         (x0, y0, z0), (x1, y1, z1) = bounds
@@ -106,14 +115,16 @@ def _map(options: argparse.Namespace) -> None:
     overrides = {"max_range": max_range}
     if options.voxel_size is not None:
         overrides["voxel_size"] = options.voxel_size
+    place = options.stream.absolute()
     _run(
         stream,
         _configure(options.config, bounds, **overrides),
-        options.output or Path("hiosdf_output") / options.stream.stem,
-        name=options.stream.name,
+        options.output or Path("hiosdf_output") / (place.name if place.is_dir() else place.stem),
+        name=place.name,
         seed=options.seed,
         truth=truth,
         save_path=options.save,
+        skip_bad_frames=options.skip_bad_frames,
     )
 
 
@@ -124,10 +135,12 @@ def _configure(name: str, bounds: Any, **overrides: float) -> Config:
 
 
 def _run(stream: Stream, config: Config, output: Path, **settings: Any) -> None:
-    from hiosdf_jax import run
+    from hiosdf_jax import datasets, run
 
     try:
         run.run_stream(stream, config, output, **settings)
+    except datasets.BadFrameError as error:
+        raise _Failure(f"{error}{_SKIP_HINT}", _BAD_INPUT) from error
     except run.NothingMappedError as error:
         raise _Failure(error, _NOTHING_MAPPED) from error
     except OSError as error:
@@ -136,9 +149,13 @@ def _run(stream: Stream, config: Config, output: Path, **settings: Any) -> None:
 
 def _checked[Result](call: Callable[[], Result], code: int = _BAD_INPUT) -> Result:
     """Calls, and makes one line of what is wrong with the input."""
+    from hiosdf_jax import datasets
+
     try:
         return call()
-    except (OSError, ValueError) as error:
+    except datasets.BadFrameError as error:
+        raise _Failure(f"{error}{_SKIP_HINT}", _BAD_INPUT) from error
+    except (OSError, ValueError, ModuleNotFoundError) as error:
         raise _Failure(_told(error), code) from error
 
 
@@ -192,10 +209,45 @@ def _parser() -> argparse.ArgumentParser:
         parents=[common],
         help="map a recorded stream",
         description="Maps a recorded stream, scores the map and draws it. A stream without exact "
-        "distances (eval_*) is scored on frames that the map is not given.",
+        "distances (eval_*) is scored on frames that the map is not given. A frame that cannot be "
+        "used ends the mapping with exit code 2; what came before it is written all the same.",
     )
     map_.add_argument(
-        "stream", type=Path, metavar="STREAM.npz", help="see hiosdf_jax/datasets/npz.py"
+        "stream",
+        type=Path,
+        metavar="STREAM",
+        help="file or folder; hiosdf_jax/datasets/ has a description of each format",
+    )
+    map_.add_argument(
+        "--format",
+        metavar="NAME",
+        help="npz, replicacad, scannet, tum, kitti, clouds or rosbag (default: what the file or "
+        "folder looks like)",
+    )
+    map_.add_argument(
+        "--skip-bad-frames",
+        action="store_true",
+        help="pass over frames that cannot be read or have no usable pose, and count them",
+    )
+    map_.add_argument(
+        "--intrinsics",
+        type=float,
+        nargs=4,
+        metavar=("FX", "FY", "CX", "CY"),
+        help="of tum: pixels (default: by freiburg1, 2 or 3 in the folder's name)",
+    )
+    map_.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="of clouds: the poses (default: the one .txt or .tum file in the folder)",
+    )
+    map_.add_argument("--cloud-topic", metavar="TOPIC", help="of rosbag, if it has several")
+    map_.add_argument(
+        "--odometry-topic", metavar="TOPIC", help="of rosbag, if tf does not say how it moves"
+    )
+    map_.add_argument(
+        "--world-frame", metavar="FRAME", help="of rosbag (default: the root of tf's tree)"
     )
     map_.add_argument(
         "--output",

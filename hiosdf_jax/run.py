@@ -17,7 +17,7 @@ import numpy as np
 
 from hiosdf_jax import checkpoint, evaluation, mapping, mesh
 from hiosdf_jax.config import Config
-from hiosdf_jax.datasets.stream import Stream
+from hiosdf_jax.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax.query import query, sdf_and_grad
 from hiosdf_jax.state import Field, Flag, MapState
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 _FIRST_HELD_OUT = 15
 _HOLD_OUT_EVERY = 10
 _HELD_OUT_POINTS = 20_000  # over all these frames
-_RIGID_TOLERANCE = 5e-3  # on R^T R - I, as in an update
 
 # A mesh is sampled about this often, within limits: no finer than anyone can see, no coarser than
 # the grid.
@@ -61,7 +60,10 @@ class Mapped:
         path_world: (F, 3) m, the sensor's positions in the frames that were mapped.
         up_world: (3,) unit vector against gravity, as well as the sensor's poses tell.
         update_seconds: (F,) s, of each update, until its result was there.
-        skipped: Frames that `update` refused.
+        last_frame: Index of the last frame that was mapped.
+        skipped: Frames that could not be used and were passed over.
+        stopped: What ended the mapping before the last frame, if anything did.
+        held_out_world: (M, 3) float32 m, returns of the frames that the map was not given.
         points_used: Points that were fused, over all frames.
         points_outside: Points in range that lay outside the bounds, over all frames.
     """
@@ -70,7 +72,10 @@ class Mapped:
     path_world: np.ndarray
     up_world: np.ndarray
     update_seconds: np.ndarray
+    last_frame: int
     skipped: int
+    stopped: BadFrameError | None
+    held_out_world: np.ndarray
     points_used: int
     points_outside: int
 
@@ -85,11 +90,15 @@ def run_stream(
     truth: evaluation.GroundTruth | None = None,
     exact_sdf: Callable[[np.ndarray], np.ndarray] | None = None,
     save_path: str | os.PathLike[str] | None = None,
+    skip_bad_frames: bool = False,
 ) -> dict[str, Any]:
     """Maps a stream, then writes what came of it into a folder and prints the scores.
 
     The folder gets `metrics.json`, `slices.png`, `mesh.ply` and `mesh.png`. A stream without
     ground truth is scored on the returns of every tenth frame, which the map is not given.
+
+    A frame that cannot be used ends the mapping: what was mapped before it is still written, since
+    it is as good as ever, and then the error is raised.
 
     Args:
         stream: The frames.
@@ -101,11 +110,13 @@ def run_stream(
         exact_sdf: Maps (n, 3) points in the world, m, to (n,) exact distances, m; drawn beside the
             map.
         save_path: Where to write the map itself, see `hiosdf_jax.load`.
+        skip_bad_frames: Pass over frames that cannot be used, and count them.
 
     Returns:
         What `metrics.json` holds.
 
     Raises:
+        BadFrameError: A frame cannot be used.
         NothingMappedError: No frame could be mapped.
         OSError: The folder or a file in it cannot be written.
     """
@@ -115,7 +126,7 @@ def run_stream(
     frames = range(len(stream))
     held_out = frames[_FIRST_HELD_OUT::_HOLD_OUT_EVERY] if truth is None else range(0)
     mapped = map_frames(
-        stream, [i for i in frames if i not in held_out], config, jax.random.key(seed)
+        stream, config, jax.random.key(seed), held_out=held_out, skip_bad_frames=skip_bad_frames
     )
     if save_path is not None:
         checkpoint.save(save_path, mapped.state)
@@ -127,10 +138,10 @@ def run_stream(
             lambda points: _sdf_and_grad(field, points),
             truth,
             sensor_position_world=mapped.path_world[-1],
-            last_frame=len(stream) - 1,
+            last_frame=mapped.last_frame,
         )
     elif held_out:
-        metrics["held_out"] = _score_held_out(field, stream, held_out)
+        metrics["held_out"] = _score_held_out(field, mapped.held_out_world)
     print(_summary(metrics))
 
     print("drawing slices.png, mesh.ply and mesh.png")
@@ -142,43 +153,62 @@ def run_stream(
     metrics["total_s"] = time.perf_counter() - start
     (output / "metrics.json").write_text(json.dumps(_plain(metrics), indent=2) + "\n", "utf-8")
     print(f"wrote {output}{os.sep} in {metrics['total_s']:.0f} s")
+    if mapped.stopped is not None:
+        raise mapped.stopped
     return metrics
 
 
-def map_frames(stream: Stream, frames: Sequence[int], config: Config, key: jax.Array) -> Mapped:
-    """Maps frames of a stream one by one, with a progress bar.
-
-    A frame that `update` refuses is reported on stderr and passed over.
+def map_frames(
+    stream: Stream,
+    config: Config,
+    key: jax.Array,
+    *,
+    held_out: Sequence[int] = (),
+    skip_bad_frames: bool = False,
+) -> Mapped:
+    """Maps the frames of a stream one by one, with a progress bar.
 
     Args:
         stream: The frames.
-        frames: Which of them, in order.
         config: The map's configuration.
         key: Source of the map's randomness.
+        held_out: Indices of frames to keep from the map; their returns are in the result.
+        skip_bad_frames: Tell of frames that cannot be used on stderr and go on. By default the
+            first one ends the mapping.
 
     Returns:
-        The map, and what is known of how it was made.
+        The map and what became of the frames.
 
     Raises:
+        BadFrameError: A frame cannot be used and nothing was mapped before it.
         NothingMappedError: No frame could be mapped.
     """
     from tqdm import tqdm
 
     state = mapping.init(config, key)
     seconds, path_world, ups_world = [], [], []
-    points_used = points_outside = skipped = 0
-    bar = tqdm(frames, desc="mapping", unit="frame")
+    kept_world, kept_rng = [np.empty((0, 3), np.float32)], np.random.default_rng(0)
+    points_used = points_outside = skipped = last_frame = 0
+    stopped = None
+    bar = tqdm(range(len(stream)), desc="mapping", unit="frame")
     for i in bar:
-        cloud, pose = stream[i]
-        start = time.perf_counter()
         try:
-            state = jax.block_until_ready(mapping.update(state, cloud, pose))
-        except ValueError as error:
+            cloud, pose = read_frame(stream, i)
+        except BadFrameError as error:
+            if not skip_bad_frames:
+                stopped = error
+                break
             skipped += 1
-            message = " ".join(str(error).split())
-            tqdm.write(f"frame {i}: {message}", file=sys.stderr)
+            tqdm.write(str(error), file=sys.stderr)
             continue
+        if i in held_out:
+            quota = max(_HELD_OUT_POINTS // len(held_out), 1)
+            kept_world.append(_draw_returns(cloud, pose, config, quota, kept_rng))
+            continue
+        start = time.perf_counter()
+        state = jax.block_until_ready(mapping.update(state, cloud, pose))
         seconds.append(time.perf_counter() - start)
+        last_frame = i
         path_world.append(pose[:3, 3])
         ups_world.append(_up_of_frame(cloud, pose))
         points_used += int(state.report.points_used)
@@ -188,8 +218,11 @@ def map_frames(stream: Stream, frames: Sequence[int], config: Config, key: jax.A
             bar.set_postfix_str(
                 f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points", refresh=False
             )
+    bar.close()
     if not seconds:
-        raise NothingMappedError(f"none of the {len(frames)} frames could be mapped")
+        raise stopped or NothingMappedError(
+            f"none of the {len(stream) - len(held_out)} frames could be mapped"
+        )
     up_world = np.mean(ups_world, axis=0)
     length = np.linalg.norm(up_world)
     return Mapped(
@@ -197,7 +230,10 @@ def map_frames(stream: Stream, frames: Sequence[int], config: Config, key: jax.A
         path_world=np.asarray(path_world, float),
         up_world=up_world / length if length > 0.1 else np.array([0.0, 0.0, 1.0]),
         update_seconds=np.asarray(seconds),
+        last_frame=last_frame,
         skipped=skipped,
+        stopped=stopped,
+        held_out_world=np.concatenate(kept_world),
         points_used=points_used,
         points_outside=points_outside,
     )
@@ -260,6 +296,7 @@ def _describe(mapped: Mapped, config: Config) -> dict[str, Any]:
     return {
         "updates": int(mapped.state.updates),
         "frames_skipped": mapped.skipped,
+        "stopped_by": None if mapped.stopped is None else str(mapped.stopped),
         "compile_s": float(mapped.update_seconds[0]),
         "update_median_ms": float(np.median(later_ms)) if len(later_ms) else math.nan,
         "update_p90_ms": float(np.percentile(later_ms, 90)) if len(later_ms) else math.nan,
@@ -271,21 +308,18 @@ def _describe(mapped: Mapped, config: Config) -> dict[str, Any]:
     }
 
 
-def _score_held_out(field: Field, stream: Stream, frames: Sequence[int]) -> dict[str, float]:
-    """Scores a map on returns of frames that it was not given, where it has seen the place."""
-    config, rng = field.config, np.random.default_rng(0)
-    quota = max(_HELD_OUT_POINTS // len(frames), 1)
-    points = [np.empty((0, 3), np.float32)]
-    for i in frames:
-        cloud, pose = stream[i]
-        gram = pose[:3, :3].T @ pose[:3, :3]
-        if not (np.isfinite(pose).all() and np.allclose(gram, np.eye(3), atol=_RIGID_TOLERANCE)):
-            continue
-        ranges = np.linalg.norm(cloud, axis=-1)  # NaN, which compares as False, for no return
-        cloud = cloud[(ranges >= config.min_range) & (ranges <= config.max_range)]
-        cloud = rng.choice(cloud, min(quota, len(cloud)), replace=False)
-        points.append(cloud @ pose[:3, :3].T + pose[:3, 3])
-    points_world = np.concatenate(points)
+def _draw_returns(
+    cloud: np.ndarray, pose: np.ndarray, config: Config, quota: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Some of a frame's returns that are in range, (n, 3), world."""
+    ranges = np.linalg.norm(cloud, axis=-1)  # NaN, which compares as False, for no return
+    cloud = cloud[(ranges >= config.min_range) & (ranges <= config.max_range)]
+    cloud = rng.choice(cloud, min(quota, len(cloud)), replace=False)
+    return cloud @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _score_held_out(field: Field, points_world: np.ndarray) -> dict[str, float]:
+    """Scores a map on returns that it was not given, where it has seen the place."""
     if not len(points_world):
         return {"points": 0, "points_observed": 0}
     observed = np.asarray(_observed(field, points_world))  # False outside the bounds
@@ -307,6 +341,8 @@ def _summary(metrics: dict[str, Any]) -> str:
     ]
     if metrics["frames_skipped"]:
         lines.append(f"{metrics['frames_skipped']} frames could not be used and were passed over")
+    if metrics["stopped_by"]:
+        lines.append(f"ended early by {metrics['stopped_by']}")
     for flag in metrics["flags"]:
         words = _FLAG_WORDS[Flag[flag]]
         if flag == Flag.POINTS_OUTSIDE.name:

@@ -4,13 +4,15 @@ import json
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 import trimesh
 from matplotlib.image import imread
 
 import hiosdf_jax as hio
-from hiosdf_jax import cli, run
+from hiosdf_jax import cli, datasets, run
+from hiosdf_jax.datasets import NpzStream
 
 # A room without furniture; the sensor walks round in it.
 LOW, HIGH = np.array([-1.2, -1.0, 0.0]), np.array([1.2, 1.0, 1.6])
@@ -149,7 +151,7 @@ def test_map_only_the_first_frames(tmp_path, capsys):
     """And bad ones among them are told and passed over, points outside told and left out."""
     stream = write_points(tmp_path / "scans.npz", 8, empty=[2], bad=[4], stray=[0, 0, 2.5])
     arguments = ["map", str(stream), "--output", str(tmp_path / "out"), "--frames", "6"]
-    assert cli.main([*arguments, *BOX]) == 0
+    assert cli.main([*arguments, *BOX, "--skip-bad-frames"]) == 0
     metrics = metrics_of(tmp_path / "out")
     assert (metrics["updates"], metrics["frames_skipped"]) == (4, 2)
     assert metrics["flags"] == ["POINTS_OUTSIDE"]
@@ -157,7 +159,7 @@ def test_map_only_the_first_frames(tmp_path, capsys):
     assert "held_out" not in metrics  # too short to keep anything back
     text = capsys.readouterr()
     assert "frame 2: cloud has no finite row" in text.err
-    assert "frame 4: pose has values that are not finite" in text.err
+    assert f"frame 4: {stream}: poses[4]: pose has values that are not finite" in text.err
     assert "2 frames could not be used" in text.out
     assert "points in range fell outside the bounds and left no surface (4 of 2404)" in text.out
 
@@ -190,15 +192,58 @@ def test_map_without_ground_truth_in_a_tilted_world(tmp_path, capsys, monkeypatc
     assert int(state.updates) == 19
 
 
+def test_the_first_bad_frame_ends_the_run(tmp_path, capsys):
+    """What was mapped before it is kept, and the exit code tells."""
+    stream = write_points(tmp_path / "scans.npz", 5, bad=[3])
+    output, saved = tmp_path / "out", tmp_path / "map.npz"
+    arguments = ["map", str(stream), "--output", str(output), "--save", str(saved)]
+    assert cli.main(arguments) == 2  # already while the bounds are found
+    message = (
+        f"hiosdf: frame 3: {stream}: poses[3]: pose has values that are not finite, "
+        "expected T_world_sensor: "
+    )
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(message)
+    assert last.endswith("(--skip-bad-frames goes on without such frames)")
+    assert not output.exists()
+    assert cli.main([*arguments, *BOX]) == 2
+    text = capsys.readouterr()
+    assert text.err.splitlines()[-1] == last
+    assert "ended early by frame 3: " in text.out
+    check_pictures(output)
+    metrics = metrics_of(output)
+    assert (metrics["updates"], metrics["frames_skipped"]) == (3, 0)
+    assert metrics["stopped_by"].startswith("frame 3: ")
+    assert int(hio.load(saved).updates) == 3
+
+
+def test_bad_frames_among_those_held_out(tmp_path):
+    stream = NpzStream(write_points(tmp_path / "scans.npz", 4, bad=[2]))
+    config = hio.Config.light(((-1.4, -1.2, -0.2), (1.4, 1.2, 1.8)), max_range=3.0)
+    key = jax.random.key(0)
+    mapped = run.map_frames(stream, config, key, held_out=[1, 2], skip_bad_frames=True)
+    assert (int(mapped.state.updates), mapped.skipped, mapped.last_frame) == (2, 1, 3)
+    cloud, pose = stream[1]
+    assert mapped.held_out_world.shape == (600, 3)  # all but the stray one, too near
+    expected = cloud[:600] @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(np.sort(mapped.held_out_world, 0), np.sort(expected, 0), atol=1e-6)
+    mapped = run.map_frames(stream, config, key, held_out=[1, 2])
+    assert (int(mapped.state.updates), mapped.last_frame) == (1, 0)
+    assert str(mapped.stopped).startswith("frame 2: ")
+
+
 def test_no_usable_frame(tmp_path, capsys):
     stream = write_points(tmp_path / "scans.npz", 2, bad=[0, 1])
     arguments = ["map", str(stream), "--output", str(tmp_path / "out")]
+    assert cli.main([*arguments, *BOX]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("hiosdf: frame 0: ")
+    arguments.append("--skip-bad-frames")
     assert cli.main([*arguments, *BOX]) == 1
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1] == "hiosdf: none of the 2 frames could be mapped"
     assert cli.main(arguments) == 1  # nor can bounds be found
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "hiosdf: none of the 2 frames has a return and a rigid pose"
+    assert last == "hiosdf: none of the 2 frames can be used"
 
 
 def broken(tmp_path, kind):
@@ -221,7 +266,11 @@ def broken(tmp_path, kind):
     ("kind", "arguments", "message"),
     [
         ("missing", [], "{stream}: No such file or directory"),
-        ("folder", [], "{stream}: Is a directory"),
+        ("folder", [], "{stream}: looks like no known format, expected one (npz: a file .npz; "),
+        ("folder", ["--format", "npz"], "{stream}: Is a directory"),
+        ("good", ["--format", "tum"], "{stream}/depth.txt: Not a directory"),
+        ("good", ["--format", "las"], "format = 'las', expected one of ['npz', "),
+        ("good", ["--world-frame", "map"], "world_frame is not an option of format 'npz'"),
         ("text", [], "{stream}: not a readable npz file"),
         ("keys", [], "{stream}: key 'K' is missing"),
         ("truth", [], "{stream}: eval_visible_sdf has shape (3,), expected (500,)"),
@@ -243,7 +292,7 @@ def test_bad_input(tmp_path, capsys, kind, arguments, message):
     last = text.splitlines()[-1]
     assert last.startswith("hiosdf: " + message.format(**names))
     assert "Traceback" not in text
-    if kind != "good":  # nothing came before it
+    if kind != "good" or "--format" in arguments:  # nothing came before it
         assert text.count("\n") == 1
 
 
@@ -273,6 +322,13 @@ def test_help():
     )
     assert "demo" in result.stdout
     assert "map" in result.stdout
+
+
+def test_help_tells_all_formats(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["map", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert ", ".join(datasets.FORMATS[:-1]) + " or " + datasets.FORMATS[-1] in text
 
 
 def test_demo(tmp_path, capsys):

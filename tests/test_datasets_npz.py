@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hiosdf_jax.datasets import NpzStream, find_bounds, ground_truth
+from hiosdf_jax.datasets import BadFrameError, NpzStream, find_bounds, ground_truth
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.exists(), reason="needs ../shared/data")
@@ -109,11 +109,15 @@ def test_is_a_sequence(tmp_path):
     np.testing.assert_array_equal(stream[0][1], POSES[0])
 
 
-def test_bad_poses_pass_through(tmp_path):
+def test_a_bad_pose_is_a_bad_frame(tmp_path):
     poses = POSES.copy()
     poses[1, 0, 0] = np.nan
-    stream = NpzStream(write(tmp_path, RANGE, poses=poses))
-    assert np.isnan(stream[1][1][0, 0])
+    path = write(tmp_path, RANGE, poses=poses)
+    stream = NpzStream(path)
+    np.testing.assert_array_equal(stream[0][1], POSES[0])
+    with pytest.raises(ValueError, match=r"poses\[1\]: pose has values .* not finite") as error:
+        stream[1]
+    assert str(path) in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -258,10 +262,12 @@ def test_frames_without_use_are_passed_over():
         (room.frames[0][0], bad),
         (np.empty((0, 3), np.float32), room.frames[0][1]),
     ]
-    assert find_bounds(room) == expected
+    assert find_bounds(room, skip_bad_frames=True) == expected
+    with pytest.raises(BadFrameError, match=r"^frame 4: cloud has no finite row among its 5"):
+        find_bounds(room)
     room.frames = room.frames[-4:]
     with pytest.raises(ValueError, match="none of the 4 frames"):
-        find_bounds(room)
+        find_bounds(room, skip_bad_frames=True)
     with pytest.raises(ValueError, match="margin = -1"):
         find_bounds(Room(), margin=-1)
 

@@ -17,11 +17,19 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
+from functools import partial
 
+import jax
 import numpy as np
 from numpy.lib.npyio import NpzFile
 
+from hiosdf_jax import sensors
+from hiosdf_jax.datasets.poses import check_pose
+from hiosdf_jax.datasets.stream import frame_index
 from hiosdf_jax.evaluation import GroundTruth
+
+_depth_to_cloud = jax.jit(sensors.depth_to_cloud)
+_ranges_to_cloud = jax.jit(sensors.ranges_to_cloud)
 
 _Shape = tuple[int | str, ...]  # a letter stands for any length
 
@@ -42,8 +50,8 @@ class NpzStream:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Loads and checks a file.
 
-        Poses are not checked beyond their count and shape: a pose that is not rigid is the map's
-        to report, frame by frame.
+        Poses are not checked here beyond their count and shape: a pose that is not rigid makes a
+        bad frame, not a bad file.
 
         Args:
             path: The `.npz` file.
@@ -74,11 +82,10 @@ class NpzStream:
         check = {"depth": self._check_depth, "range": self._check_range}
         frames = check.get(self._layout, self._check_points)()
         self._expect("poses", (frames, 4, 4))
-        self._poses = self._arrays["poses"].astype(np.float32)
 
     def __len__(self) -> int:
         """The number of frames."""
-        return len(self._poses)
+        return len(self._arrays["poses"])
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """One frame.
@@ -92,22 +99,19 @@ class NpzStream:
 
         Raises:
             IndexError: Index is out of range.
+            ValueError: The pose is not finite or not rigid.
         """
-        # Also what ends a plain `for cloud, pose in stream`.
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"{self.path}: frame {index}, expected one of {len(self)} frames")
-        index %= len(self)
+        index = frame_index(index, len(self), self.path)
+        pose = check_pose(self._arrays["poses"][index], f"{self.path}: poses[{index}]")
         if self._layout == "points_mm":
             offsets = self._arrays["offsets"]
             rows = self._arrays["points_mm"][offsets[index] : offsets[index + 1]]
             cloud = rows.astype(np.float32) / np.float32(1000)
-        else:
-            raw = self._arrays[self._layout][index]
-            lengths = raw.astype(np.float32) / self._scale
-            hit = np.isfinite(lengths) & (lengths > 0)
-            hit &= ~np.isin(raw, self._arrays.get("invalid", ()))
-            cloud = np.where(hit, lengths, np.float32(np.nan))[..., None] * self._directions
-        return cloud.reshape(-1, 3), self._poses[index].copy()
+            return cloud, pose
+        raw = self._arrays[self._layout][index]
+        lengths = raw.astype(np.float32) / self._scale
+        lengths[np.isin(raw, self._arrays.get("invalid", ()))] = np.nan
+        return np.asarray(self._to_cloud(lengths)), pose
 
     def _check_depth(self) -> int:
         depth, matrix = self._arrays["depth"], self._arrays["K"]
@@ -116,11 +120,7 @@ class NpzStream:
         if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
             raise ValueError(f"{self.path}: K = {matrix.tolist()}, expected focal lengths > 0")
         self._scale = self._positive("depth_scale")
-        v, u = np.indices(depth.shape[1:])
-        rays = np.linalg.solve(
-            matrix.astype(float), np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
-        )
-        self._directions = rays.T.reshape(*depth.shape[1:], 3).astype(np.float32)
+        self._to_cloud = partial(_depth_to_cloud, intrinsics=matrix.astype(np.float32))
         return len(depth)
 
     def _check_range(self) -> int:
@@ -129,7 +129,8 @@ class NpzStream:
             raise ValueError(f"{self.path}: range has shape {ranges.shape}, expected (F, ...)")
         self._expect("directions", (*ranges.shape[1:], 3))
         self._scale = self._positive("range_scale")
-        self._directions = self._arrays["directions"].astype(np.float32)
+        directions = self._arrays["directions"].astype(np.float32)
+        self._to_cloud = partial(_ranges_to_cloud, directions=directions)
         return len(ranges)
 
     def _check_points(self) -> int:

@@ -1,0 +1,300 @@
+"""Bags of ROS 1 and ROS 2, written here, against the closed form of the motion in them."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hiosdf_jax.datasets import BadFrameError, find_bounds, open_stream, read_frame
+from hiosdf_jax.datasets.rosbag import cloud_of
+
+rosbags = pytest.importorskip("rosbags")
+from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
+from rosbags.rosbag2 import StoragePlugin  # noqa: E402
+from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: E402
+
+START = 1_700_000_000  # s
+CLOUDS = np.random.default_rng(0).uniform(-3, 3, (5, 20, 3)).astype(np.float32)
+STAMPS = START + 0.13 + 0.1 * np.arange(5)
+TURN = 0.7  # rad/s
+MOUNT = np.eye(4)
+MOUNT[:3, :3] = Rotation.from_euler("xyz", [0.1, -0.2, 1.5]).as_matrix()
+MOUNT[:3, 3] = [0.3, -0.1, 0.5]
+POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("gap", "V4"), ("z", "<f4"), ("ring", "<u2")])
+
+
+def motion(stamp):
+    """The base in the odometry's frame: even, so that interpolation is exact."""
+    time, pose = stamp - START, np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0, 0, TURN * time]).as_matrix()
+    pose[:3, 3] = [1.5 * time, 2, -0.5 * time]
+    return pose
+
+
+class Bag:
+    """Writes messages; `kind` is ros1, sqlite3 or mcap."""
+
+    def __init__(self, path, kind):
+        self.kind = kind
+        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+        tf = "tf2_msgs/msg/TFMessage"
+        if kind == "ros1":
+            self.store.register(
+                get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf)
+            )
+        if kind == "ros1":
+            self.path = path.with_suffix(".bag")
+            self.writer = Writer1(self.path)
+        else:
+            self.path = path
+            plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+            self.writer = Writer2(self.path, version=9, storage_plugin=plugin)
+        self.connections = {}
+
+    def __enter__(self):
+        self.writer.open()
+        return self
+
+    def __exit__(self, *_):
+        self.writer.close()
+
+    def make(self, msgtype, /, **fields):
+        return self.store.types[msgtype](**fields)
+
+    def header(self, stamp, frame):
+        seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
+        time = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+        sequence = {"seq": 0} if self.kind == "ros1" else {}
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
+
+    def write(self, topic, stamp, message):
+        name = message.__msgtype__
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.store)
+        serialize = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
+        self.writer.write(self.connections[topic], round(stamp * 1e9), serialize(message, name))
+
+    def write_cloud(self, stamp, cloud, frame="lidar", topic="/points", recorded=None):
+        points = np.zeros(len(cloud), POINT)
+        points["x"], points["y"], points["z"] = cloud.T
+        fields = [
+            self.make("sensor_msgs/msg/PointField", name=n, offset=o, datatype=d, count=1)
+            for n, o, d in [("x", 0, 7), ("y", 4, 7), ("z", 12, 7), ("ring", 16, 4)]
+        ]
+        message = self.make(
+            "sensor_msgs/msg/PointCloud2",
+            header=self.header(stamp, frame),
+            height=1,
+            width=len(cloud),
+            fields=fields,
+            is_bigendian=False,
+            point_step=POINT.itemsize,
+            row_step=POINT.itemsize * len(cloud),
+            data=np.frombuffer(points.tobytes(), np.uint8),
+            is_dense=False,
+        )
+        self.write(topic, stamp + 0.05 if recorded is None else recorded, message)
+
+    def parts(self, pose):
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rotation = self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+        return dict(zip("xyz", pose[:3, 3], strict=True)), rotation
+
+    def write_transform(self, stamp, parent, child, pose, topic="/tf"):
+        position, rotation = self.parts(pose)
+        vector = self.make("geometry_msgs/msg/Vector3", **position)
+        transform = self.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(stamp, parent),
+            child_frame_id=child,
+            transform=self.make(
+                "geometry_msgs/msg/Transform", translation=vector, rotation=rotation
+            ),
+        )
+        self.write(topic, stamp, self.make("tf2_msgs/msg/TFMessage", transforms=[transform]))
+
+    def write_odometry(self, stamp, parent, child, pose, topic="/odometry"):
+        position, rotation = self.parts(pose)
+        place = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", **position),
+            orientation=rotation,
+        )
+        zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+        unknown = np.zeros(36)
+        message = self.make(
+            "nav_msgs/msg/Odometry",
+            header=self.header(stamp, parent),
+            child_frame_id=child,
+            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=unknown),
+            twist=self.make(
+                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown
+            ),
+        )
+        self.write(topic, stamp, message)
+
+
+def write_bag(path, kind, *, clouds=True, static=True, moving="tf", until=1.0):
+    with Bag(path, kind) as bag:
+        if static:
+            bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        for time in np.arange(START, START + until, 0.07):
+            if "tf" in moving:
+                bag.write_transform(time, "odom", "base", motion(time))
+            if "odometry" in moving:
+                bag.write_odometry(time, "odom", "base", motion(time))
+        if clouds:
+            for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+                bag.write_cloud(stamp, cloud)
+    return bag.path
+
+
+def check_stream(stream):
+    assert len(stream) == 5
+    for i in (3, 0, 4, 1, 2):  # in any order
+        cloud, pose = stream[i]
+        np.testing.assert_array_equal(cloud, CLOUDS[i])
+        np.testing.assert_allclose(pose, motion(STAMPS[i]) @ MOUNT, atol=2e-6)
+    assert len(list(stream)) == 5
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+@pytest.mark.parametrize("moving", ["tf", "odometry"])
+def test_bags(tmp_path, kind, moving):
+    path = write_bag(tmp_path / "drive", kind, moving=moving)
+    check_stream(open_stream(path))
+    if kind != "ros1":  # a file of the folder alone
+        [file] = [each for each in path.iterdir() if each.suffix in (".db3", ".mcap")]
+        check_stream(open_stream(file))
+
+
+def test_corrections_of_the_map_are_above_the_odometry(tmp_path):
+    correction = motion(START + 3)
+    path = write_bag(tmp_path / "drive", "ros1", moving="tf")
+    with Bag(tmp_path / "two", "sqlite3") as bag:
+        for time in np.arange(START, START + 1, 0.1):
+            bag.write_transform(time, "/map", "/odom", correction)
+            bag.write_transform(time, "odom", "base", motion(time))
+        bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud, "/lidar")
+    np.testing.assert_allclose(
+        open_stream(bag.path)[2][1], correction @ motion(STAMPS[2]) @ MOUNT, atol=1e-5
+    )
+    check_stream(open_stream(bag.path, world_frame="odom"))
+    check_stream(open_stream(path, world_frame="odom"))
+    with pytest.raises(ValueError, match="frame 'earth' is not above 'lidar'"):
+        open_stream(path, world_frame="earth")
+    _, pose = open_stream(path, world_frame="base")[0]
+    np.testing.assert_allclose(pose, MOUNT, atol=1e-6)
+
+
+def test_which_topics(tmp_path):
+    with Bag(tmp_path / "drive", "sqlite3") as bag:
+        bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        for time in np.arange(START, START + 1, 0.07):
+            bag.write_transform(time, "odom", "base", np.eye(4))  # of bad wheels
+            bag.write_odometry(time, "odom", "base", motion(time), "/good")
+            bag.write_odometry(time, "odom", "body", motion(time), "/other")
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud, topic="/points")
+            bag.write_cloud(stamp, cloud + 1, topic="/raw", recorded=stamp + 0.05)
+    with pytest.raises(
+        ValueError, match=r"cloud_topic = None, expected one of \['/points', '/raw'\]"
+    ):
+        open_stream(bag.path)
+    np.testing.assert_allclose(open_stream(bag.path, cloud_topic="/points")[0][1], MOUNT, atol=1e-6)
+    check_stream(open_stream(bag.path, cloud_topic="/points", odometry_topic="/good"))
+    with pytest.raises(ValueError, match=r"odometry_topic = '/bad', expected one of \['/good'"):
+        open_stream(bag.path, cloud_topic="/points", odometry_topic="/bad")
+    with pytest.raises(ValueError, match=r"/other moves \['body'\], expected one of \['lidar'"):
+        open_stream(bag.path, cloud_topic="/points", odometry_topic="/other")
+
+
+def test_nothing_says_how_it_moves(tmp_path):
+    path = write_bag(tmp_path / "still", "sqlite3", moving="")
+    with pytest.raises(ValueError, match="nothing moves above the clouds' frame, lidar in base"):
+        open_stream(path)
+    np.testing.assert_allclose(open_stream(path, world_frame="base")[0][1], MOUNT, atol=1e-6)
+    path = write_bag(tmp_path / "apart", "ros1", moving="odometry", static=False)
+    with pytest.raises(
+        ValueError, match=r"/odometry moves \['base'\], expected one of \['lidar'\]"
+    ):
+        open_stream(path)
+    path = write_bag(tmp_path / "blind", "ros1", clouds=False)
+    with pytest.raises(ValueError, match=r"cloud_topic = None, expected one of \[\]"):
+        open_stream(path)
+
+
+def test_clouds_of_one_recording_time(tmp_path):
+    with Bag(tmp_path / "drive", "sqlite3") as bag:
+        for time in np.arange(START, START + 1, 0.07):
+            bag.write_odometry(time, "odom", "lidar", motion(time))
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud, recorded=START + 2)
+    stream = open_stream(bag.path)
+    for i in range(5):
+        np.testing.assert_array_equal(stream[i][0], CLOUDS[i])
+        np.testing.assert_allclose(stream[i][1], motion(STAMPS[i]), atol=2e-6)
+
+
+def test_frames_without_a_transform(tmp_path):
+    stream = open_stream(write_bag(tmp_path / "drive", "ros1", until=0.4))
+    read_frame(stream, 2)
+    with pytest.raises(BadFrameError, match=r"frame 4: .*base in odom: no pose for 1700000000\.53"):
+        read_frame(stream, 4)
+    with pytest.raises(BadFrameError, match=r"^frame 3: "):
+        find_bounds(stream)
+    assert find_bounds(stream, skip_bad_frames=True).max_range > 2
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_broken_bags(tmp_path, kind):
+    path = write_bag(tmp_path / "drive", kind)
+    file = path if kind == "ros1" else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    content = file.read_bytes()
+    for broken in (b"", b"not a bag", content[:300], content[: len(content) // 2]):
+        file.write_bytes(broken)
+        with pytest.raises(ValueError, match=re.escape(str(path))):
+            open_stream(path)
+
+
+def test_kinds_of_points():
+    def message(points, height=1, row_pad=0, big=False):
+        types = {"f4": 7, "f8": 8, "i2": 3}
+        fields = [
+            SimpleNamespace(name=n, offset=o, datatype=types[d.str[1:]], count=1)
+            for n, (d, o) in points.dtype.fields.items()
+        ]
+        step, width = points.dtype.itemsize, len(points) // height
+        rows = points.reshape(height, width)
+        data = b"".join(row.tobytes() + bytes(row_pad) for row in rows)
+        return SimpleNamespace(
+            fields=fields,
+            height=height,
+            width=width,
+            is_bigendian=big,
+            point_step=step,
+            row_step=width * step + row_pad,
+            data=np.frombuffer(data, np.uint8),
+        )
+
+    expected = np.arange(18).reshape(6, 3)
+    for kind, big in [("<f4", False), ("<f8", False), (">f4", True), ("<i2", False)]:
+        points = np.zeros(6, [("z", kind), ("y", kind), ("x", kind)])
+        points["x"], points["y"], points["z"] = expected.T
+        for height, pad in [(1, 0), (2, 0), (3, 8)]:
+            cloud = cloud_of(message(points, height, pad, big))
+            assert cloud.dtype == np.float32
+            np.testing.assert_array_equal(cloud, expected)
+    assert cloud_of(message(points[:0])).shape == (0, 3)
+    short = message(points)
+    short.data = short.data[:-1]
+    with pytest.raises(ValueError, match="35 bytes in rows of 36, expected 1 x 6 points of 6"):
+        cloud_of(short)
+    with pytest.raises(ValueError, match=r"fields are \['x'\], expected x, y and z"):
+        cloud_of(message(np.zeros(2, [("x", "<f4")])))
