@@ -1,19 +1,22 @@
 """Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463)."""
 
+from hiosdf_jax.bake import bake
 from hiosdf_jax.checkpoint import load, save
 from hiosdf_jax.config import Config
 from hiosdf_jax.mapping import grow, init, snapshot, update
 from hiosdf_jax.mesh import extract_mesh
 from hiosdf_jax.query import query, sdf, sdf_and_grad
-from hiosdf_jax.state import Field, Flag, MapState, Query, Report
+from hiosdf_jax.state import Baked, Field, Flag, MapState, Query, Report
 
 __all__ = [
+    "Baked",
     "Config",
     "Field",
     "Flag",
     "MapState",
     "Query",
     "Report",
+    "bake",
     "extract_mesh",
     "grow",
     "init",

@@ -19,7 +19,7 @@ from hiosdf_jax.mapping import init
 from hiosdf_jax.state import MapState
 
 _FORMAT = "hiosdf_jax map"
-_VERSION = 1
+_VERSION = 2
 
 
 def save(path: str | os.PathLike[str], state: MapState) -> None:

@@ -35,6 +35,7 @@ class Config:
         min_hit_ratio: Share hits / (hits + passes) below which a surface is carved away.
         evidence_limit: Rays a voxel remembers; older evidence fades once there are more.
         distance_horizon: Largest distance that the grid resolves, m; at most 127 voxels.
+        frontier_horizon: Largest distance to unseen space that the grid resolves, m.
         near_samples: Samples an update draws where |sdf| < near_distance (the paper's N) [IV-B].
         far_samples: Samples an update draws in the rest of the observed map (M) [IV-B].
         near_distance: The paper's epsilon, m [IV-B].
@@ -58,6 +59,8 @@ class Config:
         warmup_updates: How many updates count as the first ones.
         weight_average: Share of the old weights in the running average over updates that queries
             use; 0 serves the latest weights. Training itself never sees the average.
+        grid_share: Share of the grid's own distance in what queries answer where it knows one; the
+            network has the rest, and all of what lies beyond the horizon. 0 is the paper's.
     """
 
     bounds: Bounds
@@ -70,6 +73,7 @@ class Config:
     min_hit_ratio: float = 0.2
     evidence_limit: float = 100.0
     distance_horizon: float = 3.0
+    frontier_horizon: float = 1.0
     near_samples: int = 10_000
     far_samples: int = 30_000
     near_distance: float = 0.05
@@ -90,6 +94,7 @@ class Config:
     warmup_epochs: int = 50
     warmup_updates: int = 5
     weight_average: float = 0.9
+    grid_share: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", _checked_bounds(self.bounds))
@@ -175,7 +180,7 @@ class Config:
         Raises:
             ValueError: A value is out of range; the message names field, value and bound.
         """
-        return cls(**_known({"local_points": 100, "bounds": bounds} | overrides))
+        return cls(**_known({"local_points": 100, "grid_share": 0.9, "bounds": bounds} | overrides))
 
     @property
     def corner_index(self) -> tuple[int, int, int]:
@@ -193,6 +198,11 @@ class Config:
     def horizon_voxels(self) -> int:
         """The distance horizon in whole voxels, rounded up."""
         return math.ceil(self.distance_horizon / self.voxel_size - _LATTICE_TOLERANCE_VOXELS)
+
+    @property
+    def frontier_voxels(self) -> int:
+        """The frontier's horizon in whole voxels, rounded up."""
+        return math.ceil(self.frontier_horizon / self.voxel_size - _LATTICE_TOLERANCE_VOXELS)
 
     def _lattice_bounds(self) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
         (x0, y0, z0), (x1, y1, z1) = self.bounds
@@ -214,8 +224,9 @@ _LIMITS: tuple[tuple[str, float, float], ...] = (
     ("max_range", 1e-3, 1e4),
     ("min_hits", 1, 1_000),
     ("min_hit_ratio", 0.0, 1.0),
-    ("evidence_limit", 1.0, 1e6),
+    ("evidence_limit", 1.0, 1000.0),
     ("distance_horizon", 1e-3, 1e4),
+    ("frontier_horizon", 1e-3, 1e4),
     ("near_samples", 1, 10_000_000),
     ("far_samples", 1, 10_000_000),
     ("near_distance", 1e-4, 1e3),
@@ -236,6 +247,7 @@ _LIMITS: tuple[tuple[str, float, float], ...] = (
     ("warmup_epochs", 1, 100_000),
     ("warmup_updates", 0, 1_000_000),
     ("weight_average", 0.0, 0.999),
+    ("grid_share", 0.0, 1.0),
 )
 
 _LIGHT: dict[str, Any] = {
@@ -253,6 +265,7 @@ _LIGHT: dict[str, Any] = {
     "eikonal_every": 2,
     "learning_rate": 1e-3,
     "weight_average": 0.8,
+    "grid_share": 0.9,
 }
 
 

@@ -11,12 +11,17 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax import uncertainty
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid import distance, geometry, lookup, rays, sampling, surface
+from hiosdf_jax.grid import distance, frontier, geometry, rays, sampling, surface
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
+from hiosdf_jax.query import field_of
 from hiosdf_jax.samples import concatenate
-from hiosdf_jax.state import Field, Flag, Grid, MapState, Report
+from hiosdf_jax.state import Field, Flag, Grid, MapState, Report, Surface
+
+# The grid's floats as they are kept between updates: half the memory, and finer than the noise.
+_STORED = jnp.float16
 
 # How far R^T R may be from the identity: real trajectories are written with few digits.
 _RIGID_TOLERANCE = 5e-3
@@ -44,6 +49,7 @@ def init(config: Config, key: jax.Array) -> MapState:
         config=config,
         grid=_empty_grid(config),
         network=training.init_network(config, network_key),
+        optimism=uncertainty.initial(),
         key=key,
         updates=zero,
         report=Report(
@@ -88,22 +94,18 @@ def update(state: MapState, cloud: Any, pose: Any) -> MapState:
     return _update_jit(state, _to_capacity(cloud, pose, state.config.max_points), pose)
 
 
-def snapshot(state: MapState) -> Field:
+def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
     """Copies what queries need, so that a planner can hold it while the map goes on.
 
     Args:
         state: The map.
+        stamp: When that is, s on the caller's clock; kept as float32, so count from a start.
 
     Returns:
         A field that shares no memory with the map.
     """
-    return Field(
-        config=state.config,
-        params=jax.tree.map(jnp.copy, state.network.served),
-        origin_world=jnp.copy(state.network.origin_world),
-        observed=lookup.observed(state.grid),
-        updates=jnp.copy(state.updates),
-    )
+    field = jax.tree.map(jnp.copy, field_of(state))
+    return field.replace(stamp=jnp.asarray(stamp, jnp.float32))
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
@@ -153,7 +155,7 @@ _update_jit = jax.jit(_update)
 
 def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> MapState:
     config = state.config
-    key, grid_key, local_key, order_key = jax.random.split(state.key, 4)
+    key, grid_key, local_key, order_key, check_key = jax.random.split(state.key, 5)
 
     # The cloud in the world.
     cloud = jnp.where(finite[:, None], cloud, 0)
@@ -166,8 +168,12 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     directions_world = offsets_world / jnp.maximum(ranges, 1e-6)[:, None]
     _, _, inside = geometry.voxel_of(config, points_world)
 
+    # How well the map so far foretold the newest cloud.
+    optimism = uncertainty.calibrate(field_of(state), points_world, ends & inside, check_key)
+
     # The coarse grid (paper, IV-B).
-    grid = surface.fuse_hits(config, state.grid, points_world, ends, sensor_world)
+    grid = _with_evidence_as(state.grid, jnp.float32)
+    grid = surface.fuse_hits(config, grid, points_world, ends, sensor_world)
     grid = rays.trace_rays(
         config,
         grid,
@@ -177,8 +183,9 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
         ends,
         sensor_world,
     )
-    grid = rays.fade_evidence(config, grid, sensor_world)
+    grid = _with_evidence_as(rays.fade_evidence(config, grid, sensor_world), _STORED)
     grid = distance.update_distances(config, grid, sensor_world)
+    grid = frontier.update_frontier(config, grid, sensor_world)
 
     # What the network learns from (IV-B, IV-C), and its fit (IV-D).
     samples = concatenate(
@@ -205,6 +212,7 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     return state.replace(
         grid=grid,
         network=network,
+        optimism=optimism,
         key=key,
         updates=state.updates + 1,
         report=Report(
@@ -222,14 +230,28 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
 def _empty_grid(config: Config) -> Grid:
     shape = config.grid_shape
     return Grid(
-        hits=jnp.zeros(shape),
-        passes=jnp.zeros(shape),
-        behind=jnp.zeros(shape),
-        weight=jnp.zeros(shape),
-        mean=jnp.zeros((*shape, 3), jnp.float16),
-        axes=jnp.zeros((*shape, 3, 3), jnp.float16),
-        nearest=jnp.full((*shape, 3), distance.NO_FEATURE, jnp.int8),
-        sdf=jnp.full(shape, config.distance_horizon, jnp.float32),
+        hits=jnp.zeros(shape, _STORED),
+        passes=jnp.zeros(shape, _STORED),
+        behind=jnp.zeros(shape, _STORED),
+        weight=jnp.zeros(shape, _STORED),
+        surface=Surface(
+            mean=jnp.zeros((*shape, 3), _STORED),
+            axes=jnp.zeros((*shape, 3, 3), _STORED),
+            nearest=jnp.full((*shape, 3), distance.NO_FEATURE, jnp.int8),
+            sdf=jnp.full(shape, config.distance_horizon, _STORED),
+            doubt=jnp.full(shape, config.distance_horizon, _STORED),
+            frontier=jnp.full(shape, -config.frontier_horizon, _STORED),
+        ),
+    )
+
+
+def _with_evidence_as(grid: Grid, dtype: Any) -> Grid:
+    """What the rays counted, in another precision: one cloud may add more than float16 holds."""
+    return grid.replace(
+        hits=grid.hits.astype(dtype),
+        passes=grid.passes.astype(dtype),
+        behind=grid.behind.astype(dtype),
+        weight=grid.weight.astype(dtype),
     )
 
 

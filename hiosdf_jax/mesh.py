@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
+from hiosdf_jax.lattice import sample_counts
 from hiosdf_jax.query import query
 from hiosdf_jax.state import Field, MapState
 
@@ -36,9 +37,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     """
     _check_resolution(resolution)
     low, high = np.asarray(field.config.bounds)
-    # Tolerant, so that 3 m at 0.1 m are 31 samples and not 32.
-    x, y, z = np.ceil((high - low) / resolution - 1e-6).astype(int) + 1
-    shape = (int(x), int(y), int(z))
+    shape = sample_counts(high - low, resolution)
     count = math.prod(shape)
     sdf, observed = np.empty(count, np.float32), np.empty(count, bool)
     for start in range(0, count, _CHUNK):

@@ -46,34 +46,51 @@ class Report(flax.struct.PyTreeNode):
     flags: jax.Array
 
 
-class Grid(flax.struct.PyTreeNode):
-    """The coarse global grid: what each voxel remembers of the rays that met it.
+class Surface(flax.struct.PyTreeNode):
+    """What queries read of the grid: its surface patches, and distances derived from them.
 
-    Lengths are in voxels; offsets are from the voxel's centre. The first six arrays are evidence,
-    the last two are derived from it by `distance.update_distances`.
+    Lengths are in voxels where no unit is given; offsets are from the voxel's centre.
 
     Attributes:
-        hits: Rays that ended in the voxel (fading), (X, Y, Z) float32.
-        passes: Rays that went through it well before their end (fading), (X, Y, Z) float32.
-        behind: Rays that ended a little before it (fading), (X, Y, Z) float32.
-        weight: Sum of the weights of the hits (fading), (X, Y, Z) float32.
         mean: Weighted mean of the hits, (X, Y, Z, 3) float16.
         axes: Principal axes of the hits, longest first, each as long as the standard deviation
             along it; the last is the normal, pointing to the sensor's side,
             (X, Y, Z, 3, 3) float16.
         nearest: Offset in whole voxels to the voxel of the nearest feature, (X, Y, Z, 3) int8;
             -128 where there is none within the horizon.
-        sdf: Signed distance of the voxel's centre to that feature, m, (X, Y, Z) float32.
+        sdf: Signed distance of the voxel's centre to that feature, m, (X, Y, Z) float16.
+        doubt: Distance of the voxel's centre to the nearest voxel in which any ray has ended and
+            that is not all but certainly free: surfaces that were carved or met once are among
+            them, m, (X, Y, Z) float16.
+        frontier: Distance of the voxel's centre to the nearest voxel that no ray has reached, m;
+            of such voxels, minus the distance to the nearest one that was reached,
+            (X, Y, Z) float16.
+    """
+
+    mean: jax.Array
+    axes: jax.Array
+    nearest: jax.Array
+    sdf: jax.Array
+    doubt: jax.Array
+    frontier: jax.Array
+
+
+class Grid(flax.struct.PyTreeNode):
+    """The coarse global grid: what each voxel remembers of the rays that met it.
+
+    Attributes:
+        hits: Rays that ended in the voxel (fading), (X, Y, Z) float16.
+        passes: Rays that went through it well before their end (fading), (X, Y, Z) float16.
+        behind: Rays that ended a little before it (fading), (X, Y, Z) float16.
+        weight: Sum of the weights of the hits (fading), (X, Y, Z) float16.
+        surface: The patches that the hits make, and what is derived from all this.
     """
 
     hits: jax.Array
     passes: jax.Array
     behind: jax.Array
     weight: jax.Array
-    mean: jax.Array
-    axes: jax.Array
-    nearest: jax.Array
-    sdf: jax.Array
+    surface: Surface
 
 
 class Network(flax.struct.PyTreeNode):
@@ -99,6 +116,8 @@ class MapState(flax.struct.PyTreeNode):
         config: The configuration; static, not a leaf.
         grid: The coarse global grid.
         network: The SIREN and its optimiser.
+        optimism: How many of its own error scales the map errs to the free side, see
+            `uncertainty`, () float32.
         key: Source of all randomness, a typed key.
         updates: Updates that changed the map so far, int32.
         report: Scalars of the last update.
@@ -107,6 +126,7 @@ class MapState(flax.struct.PyTreeNode):
     config: Config = flax.struct.field(pytree_node=False)
     grid: Grid
     network: Network
+    optimism: jax.Array
     key: jax.Array
     updates: jax.Array
     report: Report
@@ -116,29 +136,60 @@ class Field(flax.struct.PyTreeNode):
     """What a planner holds while the map goes on; made by `snapshot`.
 
     Attributes:
-        config: The configuration; static, not a leaf.
-        params: The weights that queries use.
+        config: The map's configuration; static, not a leaf.
+        params: The network's weights that queries use.
         origin_world: Point that is the network's zero, (3,) m.
-        observed: Whether a ray has reached the voxel, (X, Y, Z) bool.
+        surface: The grid's patches and distances.
+        optimism: As in `MapState`, () float32.
         updates: Updates that the map had seen, int32.
+        stamp: When the snapshot was taken, s on the caller's clock, () float32.
     """
 
     config: Config = flax.struct.field(pytree_node=False)
     params: Any
     origin_world: jax.Array
-    observed: jax.Array
+    surface: Surface
+    optimism: jax.Array
     updates: jax.Array
+    stamp: jax.Array
+
+
+class Baked(flax.struct.PyTreeNode):
+    """Samples of a field on a lattice, for inner loops; made by `bake`.
+
+    Attributes:
+        corner_world: Position of sample (0, 0, 0), (3,) m.
+        resolution: Spacing of the samples, () m.
+        sdf: Signed distances, m, (X, Y, Z) float32.
+        frontier: Distances to unseen space, m, (X, Y, Z) float32.
+        lower: Lower bounds of the distance, m, (X, Y, Z) float32.
+        updates: Updates that the map had seen, int32.
+        stamp: As in `Field`.
+    """
+
+    corner_world: jax.Array
+    resolution: jax.Array
+    sdf: jax.Array
+    frontier: jax.Array
+    lower: jax.Array
+    updates: jax.Array
+    stamp: jax.Array
 
 
 class Query(NamedTuple):
     """What the map says of points.
 
     Attributes:
-        sdf: Signed distance, (...) float32, m.
+        sdf: Signed distance under the chosen policy for unseen space, (...) float32, m.
         grad: Its gradient by the point, (..., 3) float32.
         observed: Whether the voxel that contains the point has been seen, (...) bool.
+        frontier: Distance to the nearest voxel that has not been seen, (...) float32, m; not
+            positive in such voxels.
+        lower: A lower bound of the true distance, (...) float32, m; see `uncertainty`.
     """
 
     sdf: jax.Array
     grad: jax.Array
     observed: jax.Array
+    frontier: jax.Array
+    lower: jax.Array

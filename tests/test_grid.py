@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 import hiosdf_jax as hio
 from hiosdf_jax import mapping
-from hiosdf_jax.grid import distance, geometry, lookup, rays, sampling, surface
+from hiosdf_jax.grid import distance, frontier, geometry, lookup, rays, sampling, surface
 from hiosdf_jax.samples import draw_from_mask
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
@@ -27,10 +27,12 @@ fuse_hits = jax.jit(surface.fuse_hits, static_argnums=0)
 trace_rays = jax.jit(rays.trace_rays, static_argnums=0)
 fade_evidence = jax.jit(rays.fade_evidence, static_argnums=0)
 update_distances = jax.jit(distance.update_distances, static_argnums=0)
+update_frontier = jax.jit(frontier.update_frontier, static_argnums=0)
 
 
 def empty_grid(config=CONFIG):
-    return mapping._empty_grid(config)
+    """As stages see it: what the rays counted in float32."""
+    return mapping._with_evidence_as(mapping._empty_grid(config), jnp.float32)
 
 
 def uniform(seed, count, low=BOUNDS[0], high=BOUNDS[1]):
@@ -81,12 +83,20 @@ def test_voxel_and_offset_do_not_depend_on_the_bounds():
     np.testing.assert_array_equal(offset, offset_larger)
 
 
-def test_trilinear_interpolation_is_exact_for_affine_functions():
-    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
-    values = np.asarray(geometry.voxel_center(CONFIG, index)) @ [1.0, -2.0, 0.5] + 3
-    points = uniform(2, 300, np.add(BOUNDS[0], 0.06), np.subtract(BOUNDS[1], 0.06))
-    result = lookup.interpolate(CONFIG, jnp.asarray(values, jnp.float32), points)
-    np.testing.assert_allclose(result, points @ np.array([1.0, -2.0, 0.5]) + 3, atol=1e-5)
+def test_corners_interpolate_affine_functions_exactly_and_know_the_border():
+    points = uniform(2, 300)
+    corners = geometry.corners_of(CONFIG, points)
+    centers = geometry.voxel_center(CONFIG, corners.index)
+    between = np.sum(centers * np.asarray(corners.weight)[..., None], axis=-2)
+    np.testing.assert_allclose(between, points, atol=1e-6)
+    index = np.asarray(corners.index)
+    inside = np.all((index >= 0) & (index < SHAPE), axis=-1)
+    assert 50 < np.sum(~inside.all(axis=1)) < 299
+    np.testing.assert_array_equal(corners.inside, inside)
+    clipped = np.clip(index, 0, np.array(SHAPE) - 1)
+    np.testing.assert_array_equal(
+        corners.flat, np.ravel_multi_index(tuple(np.moveaxis(clipped, -1, 0)), SHAPE)
+    )
 
 
 @pytest.mark.parametrize("center", [(0.3, 0.5, 0.6), (-0.29, 0.99, 0.21), (9.0, -9.0, 0.5)])
@@ -129,8 +139,8 @@ def test_patches_are_the_weighted_moments_of_all_hits():
         checked += 1
         assert float(grid.hits[at]) == here.sum()
         np.testing.assert_allclose(grid.weight[at], w.sum(), rtol=1e-4)
-        np.testing.assert_allclose(grid.mean[at], mean, atol=2e-3)  # float16
-        axes = np.asarray(grid.axes[at], np.float64)
+        np.testing.assert_allclose(grid.surface.mean[at], mean, atol=2e-3)  # float16
+        axes = np.asarray(grid.surface.axes[at], np.float64)
         np.testing.assert_allclose(axes.T @ axes, spread, atol=1e-3)
         lengths = np.linalg.norm(axes, axis=1)
         assert lengths[0] >= lengths[1] >= lengths[2]
@@ -151,7 +161,7 @@ def test_the_order_of_rows_does_not_matter():
     points = uniform(6, 400, (0.0, 0.1, 0.3), (0.3, 0.4, 0.5))
     a, b = fuse(empty_grid(), points), fuse(empty_grid(), points[::-1].copy())
     np.testing.assert_array_equal(a.hits, b.hits)
-    np.testing.assert_allclose(a.mean, b.mean, atol=1e-3)
+    np.testing.assert_allclose(a.surface.mean, b.surface.mean, atol=1e-3)
     spread = [jnp.einsum("...ki,...kj->...ij", g.axes, g.axes).astype(np.float32) for g in (a, b)]
     np.testing.assert_allclose(*spread, atol=1e-3)
 
@@ -318,7 +328,7 @@ def test_grid_distance_of_a_room_is_exact_in_value_sign_and_gradient():
     exact = np.where(
         (gaps > 0).all(axis=1), gaps.min(axis=1), -np.linalg.norm(np.minimum(gaps, 0), axis=1)
     )
-    value, gradient = lookup.grid_sdf_and_grad(CONFIG, grid, jnp.asarray(points))
+    value, gradient = lookup.grid_sdf_and_grad(CONFIG, grid.surface, jnp.asarray(points))
     inside = exact > 0
     error = np.asarray(value) - exact
     assert np.abs(error[inside]).mean() < 0.002
@@ -335,8 +345,8 @@ def test_grid_distance_of_a_room_is_exact_in_value_sign_and_gradient():
     normal = -np.sign(points - center)[plain] * (np.arange(3) == axis[:, None])
     assert np.mean(np.sum(np.asarray(gradient)[plain] * normal, axis=1)) > 0.99
     assert np.isfinite(np.asarray(gradient)).all()
-    batch = lookup.grid_sdf(CONFIG, grid, jnp.asarray(points[:20]))
-    single = [lookup.grid_sdf(CONFIG, grid, jnp.asarray(p)) for p in points[:20]]
+    batch = lookup.grid_sdf(CONFIG, grid.surface, jnp.asarray(points[:20]))
+    single = [lookup.grid_sdf(CONFIG, grid.surface, jnp.asarray(p)) for p in points[:20]]
     np.testing.assert_allclose(batch, single, atol=1e-6)
 
 
@@ -344,8 +354,8 @@ def test_grid_distance_against_brute_force_over_all_patches():
     grid = wall_room(CONFIG, seeds=range(2))
     features = np.asarray(surface.is_feature(CONFIG, grid.hits, grid.passes))
     cells = np.argwhere(features)
-    mean = np.asarray(grid.mean, np.float64)[features] + cells + CONFIG.corner_index + 0.5
-    axes = np.asarray(grid.axes, np.float64)[features]
+    mean = np.asarray(grid.surface.mean, np.float64)[features] + cells + CONFIG.corner_index + 0.5
+    axes = np.asarray(grid.surface.axes, np.float64)[features]
     points = uniform(12, 400).astype(np.float64)
     # float64 again, from the definition of a patch
     offset = points[:, None] / 0.1 - mean
@@ -354,7 +364,7 @@ def test_grid_distance_against_brute_force_over_all_patches():
         along = np.clip((offset * half).sum(-1) / np.maximum((half**2).sum(-1), 1e-12), -1, 1)
         offset = offset - along[..., None] * half
     exact = 0.1 * np.linalg.norm(offset, axis=-1).min(axis=1)
-    value = np.abs(lookup.grid_sdf(CONFIG, grid, jnp.asarray(points, jnp.float32)))
+    value = np.abs(lookup.grid_sdf(CONFIG, grid.surface, jnp.asarray(points, jnp.float32)))
     assert (value - exact).min() > -1e-4
     assert np.mean(value - exact > 1e-4) < 0.02
     assert (value - exact).max() < 0.01
@@ -368,7 +378,7 @@ def test_a_sheet_seen_from_both_sides_is_free_on_both():
         grid = trace(fuse(grid, ends, sensor), ends, sensor)
     grid = update_distances(CONFIG, grid, jnp.array([0.3, 0.5, 0.6]))
     points = uniform(14, 300, (0.2, 0.3, 0.45), (0.52, 0.7, 0.75))
-    value = np.asarray(lookup.grid_sdf(CONFIG, grid, points))
+    value = np.asarray(lookup.grid_sdf(CONFIG, grid.surface, points))
     assert np.mean(value >= 0) > 0.99
     # Patches leave narrow gaps between each other: exact in the mean, within 1 cm everywhere.
     error = value - np.abs(points[:, 0] - 0.36)
@@ -378,7 +388,9 @@ def test_a_sheet_seen_from_both_sides_is_free_on_both():
 
 def test_a_window_gives_what_a_full_recomputation_gives():
     bounds = ((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
-    small = dataclasses.replace(CONFIG, bounds=bounds, max_range=0.5, distance_horizon=0.6)
+    small = dataclasses.replace(
+        CONFIG, bounds=bounds, max_range=0.5, distance_horizon=0.6, frontier_horizon=0.4
+    )
     large = dataclasses.replace(small, max_range=50.0)
     assert geometry.window_shape(small, 2.0)[0] == 40
     assert geometry.window_shape(small, 1.8)[0] < 40
@@ -393,13 +405,13 @@ def test_a_window_gives_what_a_full_recomputation_gives():
                 sensor,
                 config=config,
             )
-            grids[k] = update_distances(config, grid, jnp.asarray(sensor, jnp.float32))
-    np.testing.assert_array_equal(grids[0].nearest, grids[1].nearest)
-    np.testing.assert_array_equal(grids[0].sdf, grids[1].sdf)
+            grid = update_distances(config, grid, jnp.asarray(sensor, jnp.float32))
+            grids[k] = update_frontier(config, grid, jnp.asarray(sensor, jnp.float32))
+    assert same(grids[0].surface, grids[1].surface)
 
 
 def test_an_empty_grid_answers_the_horizon():
-    value, gradient = lookup.grid_sdf_and_grad(CONFIG, empty_grid(), uniform(15, 20))
+    value, gradient = lookup.grid_sdf_and_grad(CONFIG, empty_grid().surface, uniform(15, 20))
     np.testing.assert_array_equal(value, np.full(20, 1.5, np.float32))
     assert np.isfinite(np.asarray(gradient)).all()
 
@@ -414,12 +426,12 @@ def test_samples_are_near_and_far_and_carry_the_grids_distance():
     assert np.asarray(samples.weight).all()
     index, _, inside = geometry.voxel_of(CONFIG, samples.points_world)
     assert np.asarray(inside).all()
-    at_center = np.abs(np.asarray(grid.sdf)[tuple(np.asarray(index).T)])
+    at_center = np.abs(np.asarray(grid.surface.sdf)[tuple(np.asarray(index).T)])
     assert (at_center[:300] < 0.05).all()
     assert (at_center[300:] >= 0.05).all()
-    known = np.asarray(lookup.observed(grid) | (grid.behind > 0))
+    known = np.asarray(lookup.observed(grid.passes, grid.hits) | (grid.behind > 0))
     assert known[tuple(np.asarray(index).T)].all()
-    expected = lookup.grid_sdf(CONFIG, grid, samples.points_world)
+    expected = lookup.grid_sdf(CONFIG, grid.surface, samples.points_world)
     np.testing.assert_allclose(samples.sdf, expected, atol=1e-6)
     nothing = sampling.sample_grid(CONFIG, empty_grid(), jax.random.key(0))
     assert not np.asarray(nothing.weight).any()

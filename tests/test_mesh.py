@@ -139,7 +139,7 @@ def test_a_map_is_sampled_over_its_bounds(monkeypatch, empty_map):
         shapes.add(points.shape)
         jax.debug.callback(lambda p: samples.append(np.asarray(p)), points)
         sdf = jnp.linalg.norm(points - CENTER, axis=-1) - 0.8
-        return Query(sdf, points, points[:, 2] < 0.02)
+        return Query(sdf, points, points[:, 2] < 0.02, sdf, sdf)
 
     monkeypatch.setattr(mesh, "query", sphere_query)
     plain = mesh._sample.__wrapped__

@@ -116,7 +116,7 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
         sensor_world: (3,) m.
 
     Returns:
-        The grid with nearest and sdf as if recomputed everywhere.
+        The grid with nearest, sdf and doubt as if recomputed everywhere.
     """
     horizon_m = config.horizon_voxels * config.voxel_size
     changed = config.max_range + horizon_m + config.voxel_size
@@ -124,12 +124,20 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
     start = geometry.window_start(config, shape, sensor_world)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)
-        for array in (grid.hits, grid.passes, grid.behind, grid.mean, grid.axes)
+        for array in (
+            grid.hits,
+            grid.passes,
+            grid.behind,
+            grid.surface.mean,
+            grid.surface.axes,
+        )
     )
-    mean = mean.astype(jnp.float32)
+    hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
     features = surface.is_feature(config, hits, passes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels)
     nearest = nearest.ravel()
+    _, squared = nearest_sites(surface.is_doubtful(hits, passes), mean, config.horizon_voxels)
+    doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
     free = is_free(passes, behind)
     flat_mean, flat_axes = mean.reshape(-1, 3), axes.reshape(-1, 3, 3)
     flat_behind = behind.ravel()
@@ -155,11 +163,18 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
     inner = geometry.window_shape(config, changed)
     inner_start = geometry.window_start(config, inner, sensor_world)
     within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
+
+    def put(old: jax.Array, window: jax.Array) -> jax.Array:
+        new = geometry.read_window(window, within, inner).astype(old.dtype)
+        return geometry.write_window(old, inner_start, new)
+
+    known = grid.surface
     return grid.replace(
-        nearest=geometry.write_window(
-            grid.nearest, inner_start, geometry.read_window(jump, within, inner)
-        ),
-        sdf=geometry.write_window(grid.sdf, inner_start, geometry.read_window(sdf, within, inner)),
+        surface=known.replace(
+            nearest=put(known.nearest, jump),
+            sdf=put(known.sdf, sdf),
+            doubt=put(known.doubt, doubt),
+        )
     )
 
 

@@ -60,14 +60,18 @@ def flat_index(shape: tuple[int, ...], index: jax.Array) -> jax.Array:
 
 
 class Corners(NamedTuple):
-    """The eight voxels around points, with the weights of trilinear interpolation.
+    """The eight voxels whose centres surround points, with the weights of trilinear interpolation.
 
     Attributes:
-        index: (..., 8, 3) int32 into the grid.
+        index: (..., 8, 3) int32 as into the grid; at the border some lie beyond it.
+        flat: (..., 8) int32 into the raveled grid, of the nearest voxel for those beyond it.
+        inside: (..., 8) bool.
         weight: (..., 8), adding up to 1.
     """
 
     index: jax.Array
+    flat: jax.Array
+    inside: jax.Array
     weight: jax.Array
 
 
@@ -75,7 +79,7 @@ _CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)],
 
 
 def corners_of(config: Config, points_world: jax.Array) -> Corners:
-    """Finds the eight voxels whose centres surround points; at the border, the nearest ones.
+    """Finds the eight voxels whose centres surround points.
 
     Args:
         config: The map's configuration.
@@ -90,7 +94,9 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
     corner = jnp.asarray(config.corner_index, jnp.int32)
     index = (base.astype(jnp.int32) - corner)[..., None, :] + _CORNERS
     weight = jnp.prod(jnp.where(_CORNERS == 1, fraction, 1 - fraction), axis=-1)
-    return Corners(jnp.clip(index, 0, jnp.asarray(config.grid_shape) - 1), weight)
+    nearest = jnp.clip(index, 0, jnp.asarray(config.grid_shape) - 1)
+    inside = jnp.all(index == nearest, axis=-1)
+    return Corners(index, flat_index(config.grid_shape, nearest), inside, weight)
 
 
 def clamp(config: Config, points_world: jax.Array) -> jax.Array:

@@ -6,89 +6,156 @@ signed distances at the voxels' centres gives the sign.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, surface
 from hiosdf_jax.grid.distance import NO_FEATURE
-from hiosdf_jax.state import Grid
+from hiosdf_jax.state import Surface
+
+# A voxel is seen or not, even where the distance between the two is 0, m.
+_LEAST_FRONTIER = 1e-6
 
 
-def observed(grid: Grid) -> jax.Array:
+class Nearest(NamedTuple):
+    """What the grid says of points.
+
+    Attributes:
+        sdf: (...) m, signed distance to the nearest patch; the horizon where none is within it.
+        spread: (...) m, standard deviation of that patch's hits along its normal; 0 without one.
+    """
+
+    sdf: jax.Array
+    spread: jax.Array
+
+
+def observed(passes: jax.Array, hits: jax.Array) -> jax.Array:
     """Tells the voxels that a ray has reached.
 
     Args:
-        grid: The grid.
+        passes: (...) rays that went through the voxel.
+        hits: (...) rays that ended in it.
 
     Returns:
-        (X, Y, Z) bool.
+        (...) bool.
     """
-    return (grid.passes > 0) | (grid.hits > 0)
+    return (passes > 0) | (hits > 0)
 
 
-def interpolate(config: Config, values: jax.Array, points_world: jax.Array) -> jax.Array:
-    """Interpolates values at the voxels' centres trilinearly.
+def nearest_patch(config: Config, known: Surface, points_world: jax.Array) -> Nearest:
+    """Finds the nearest patch among those that the eight voxels around a point know.
 
     Args:
         config: The map's configuration.
-        values: (X, Y, Z).
+        known: The grid's surface.
         points_world: (..., 3) m; points outside the bounds take the border's value.
 
     Returns:
-        (...).
-    """
-    corners = geometry.corners_of(config, geometry.clamp(config, points_world))
-    flat = geometry.flat_index(config.grid_shape, corners.index)
-    return jnp.sum(values.ravel()[flat] * corners.weight, axis=-1)
-
-
-def grid_sdf(config: Config, grid: Grid, points_world: jax.Array) -> jax.Array:
-    """Signed distance by the grid alone.
-
-    Args:
-        config: The map's configuration.
-        grid: The grid.
-        points_world: (..., 3) m; points outside the bounds take the border's value.
-
-    Returns:
-        (...) m; the horizon where there is no feature within it. Differentiable by the points.
+        The answer; its distance is differentiable by the points.
     """
     shape = config.grid_shape
     points_world = geometry.clamp(config, points_world)
     corners = geometry.corners_of(config, points_world)
-    flat = geometry.flat_index(shape, corners.index)
-    jump = grid.nearest.reshape(-1, 3)[flat].astype(jnp.int32)
-    known = jump[..., 0] != NO_FEATURE
-    site = jnp.where(known[..., None], corners.index + jump, 0)
+    jump = known.nearest.reshape(-1, 3)[corners.flat].astype(jnp.int32)
+    found = corners.inside & (jump[..., 0] != NO_FEATURE)
+    site = jnp.where(found[..., None], corners.index + jump, 0)
     row = geometry.flat_index(shape, site)
-    mean = grid.mean.reshape(-1, 3)[row].astype(jnp.float32)
-    axes = grid.axes.reshape(-1, 3, 3)[row].astype(jnp.float32)
+    mean = known.mean.reshape(-1, 3)[row].astype(jnp.float32)
+    axes = known.axes.reshape(-1, 3, 3)[row].astype(jnp.float32)
     # Both from the same voxel's centre, so that large coordinates lose no digits.
     first = corners.index[..., :1, :]
     first_world = geometry.voxel_center(config, first)
     point = (points_world[..., None, :] - first_world) / config.voxel_size
     offset = surface.patch_offset(point, mean + (site - first), axes)
-    distance = jnp.min(jnp.where(known, surface.safe_norm(offset), jnp.inf), axis=-1)
-    side = jnp.sum(grid.sdf.ravel()[flat] * corners.weight, axis=-1)
-    metres = jnp.where(jnp.any(known, axis=-1), distance, 0) * config.voxel_size
-    return jnp.where(
-        jnp.any(known, axis=-1), jnp.where(side < 0, -metres, metres), config.distance_horizon
+    distance = jnp.where(found, surface.safe_norm(offset), jnp.inf)
+    any_found = jnp.any(found, axis=-1)
+    metres = jnp.where(any_found, jnp.min(distance, axis=-1), 0) * config.voxel_size
+    # Voxels without a feature have no side: those that `grow` adds must not change old answers.
+    signed = known.sdf.ravel()[corners.flat].astype(jnp.float32)
+    side = jnp.sum(jnp.where(found, signed * corners.weight, 0), axis=-1)
+    closest = jnp.argmin(distance, axis=-1)[..., None, None]
+    normal = jnp.take_along_axis(axes[..., 2, :], closest, axis=-2)[..., 0, :]
+    spread = jnp.where(any_found, surface.safe_norm(normal) * config.voxel_size, 0)
+    return Nearest(
+        jnp.where(any_found, jnp.where(side < 0, -metres, metres), config.distance_horizon),
+        jax.lax.stop_gradient(spread),
     )
 
 
+def grid_sdf(config: Config, known: Surface, points_world: jax.Array) -> jax.Array:
+    """Signed distance by the grid alone.
+
+    Args:
+        config: The map's configuration.
+        known: The grid's surface.
+        points_world: (..., 3) m; points outside the bounds take the border's value.
+
+    Returns:
+        (...) m; the horizon where there is no feature within it. Differentiable by the points.
+    """
+    return nearest_patch(config, known, points_world).sdf
+
+
 def grid_sdf_and_grad(
-    config: Config, grid: Grid, points_world: jax.Array
+    config: Config, known: Surface, points_world: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Signed distance by the grid alone, and its gradient.
 
     Args:
         config: The map's configuration.
-        grid: The grid.
+        known: The grid's surface.
         points_world: (..., 3) m.
 
     Returns:
         The distance (...) m and its gradient (..., 3).
     """
-    value, pull = jax.vjp(lambda points: grid_sdf(config, grid, points), points_world)
+    value, pull = jax.vjp(lambda points: grid_sdf(config, known, points), points_world)
     return value, pull(jnp.ones_like(value))[0]
+
+
+def doubt(config: Config, known: Surface, points_world: jax.Array) -> jax.Array:
+    """Distance to anything that may be a surface, interpolated trilinearly between voxels' centres.
+
+    Args:
+        config: The map's configuration.
+        known: The grid's surface.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) m. Differentiable.
+    """
+    corners = geometry.corners_of(config, points_world)
+    metres = known.doubt.ravel()[corners.flat].astype(jnp.float32)
+    # Beyond the bounds: what the voxels have that `grow` adds, so that it changes no old answer.
+    metres = jnp.where(corners.inside, metres, config.distance_horizon)
+    return jnp.sum(metres * corners.weight, axis=-1)
+
+
+def frontier(config: Config, known: Surface, points_world: jax.Array) -> jax.Array:
+    """Distance to the nearest unseen voxel, interpolated trilinearly between voxels' centres.
+
+    Args:
+        config: The map's configuration.
+        known: The grid's surface.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) m; positive in voxels that were seen, negative in others. Differentiable.
+    """
+    corners = geometry.corners_of(config, points_world)
+    metres = known.frontier.ravel()
+    around = metres[corners.flat].astype(jnp.float32)
+    around = jnp.where(corners.inside, around, -config.frontier_horizon)
+    index, _, _ = geometry.voxel_of(config, points_world)
+    here = metres[geometry.flat_index(config.grid_shape, index)]
+    # Next to a seen voxel the unseen space begins half a voxel before the unseen one's centre,
+    # whatever that one knows: beyond the bounds, and after `grow`, it knows nothing yet.
+    least = -0.5 * config.voxel_size
+    around = jnp.where((here > 0)[..., None], jnp.maximum(around, least), around)
+    between = jnp.sum(around * corners.weight, axis=-1)
+    return jnp.where(
+        here > 0, jnp.maximum(between, _LEAST_FRONTIER), jnp.minimum(between, -_LEAST_FRONTIER)
+    )

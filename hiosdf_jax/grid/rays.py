@@ -90,7 +90,8 @@ def fade_evidence(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid:
     Returns:
         The grid with scaled hits, weight, passes and behind.
     """
-    shape = geometry.window_shape(config, config.max_range)
+    hidden = (_BEHIND_STEPS + 1) * config.voxel_size
+    shape = geometry.window_shape(config, config.max_range + hidden)
     start = geometry.window_start(config, shape, sensor_world)
     hits, weight, passes, behind = (
         geometry.read_window(array, start, shape)

@@ -26,8 +26,10 @@ def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
     Returns:
         near_samples + far_samples samples, without weight where there is no such voxel.
     """
-    known = (lookup.observed(grid) | (grid.behind > 0)) & (grid.nearest[..., 0] != NO_FEATURE)
-    near = known & (jnp.abs(grid.sdf) < config.near_distance)
+    known = (lookup.observed(grid.passes, grid.hits) | (grid.behind > 0)) & (
+        grid.surface.nearest[..., 0] != NO_FEATURE
+    )
+    near = known & (jnp.abs(grid.surface.sdf) < config.near_distance)
     near_key, far_key, place_key = jax.random.split(key, 3)
     near_voxel, any_near = draw_from_mask(near, config.near_samples, near_key)
     far_voxel, any_far = draw_from_mask(known & ~near, config.far_samples, far_key)
@@ -41,4 +43,4 @@ def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
     index = jnp.stack(jnp.unravel_index(voxel, config.grid_shape), axis=-1)
     place = jax.random.uniform(place_key, index.shape, minval=-0.5, maxval=0.5)
     points_world = geometry.voxel_center(config, index) + place * config.voxel_size
-    return Samples(points_world, lookup.grid_sdf(config, grid, points_world), weight)
+    return Samples(points_world, lookup.grid_sdf(config, grid.surface, points_world), weight)

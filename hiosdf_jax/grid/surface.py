@@ -24,6 +24,9 @@ _LEAST_DEVIATION = 1e-3
 
 _JACOBI_SWEEPS = 5
 
+# Voxels whose rays ended in them at least this often may hold a surface, whatever else they say.
+_DOUBT_RATIO = 0.02
+
 
 def fuse_hits(
     config: Config,
@@ -76,7 +79,7 @@ def fuse_hits(
     # Chan's rule merges the two means and covariances.
     old_hits, old_weight, old_mean, old_axes = (
         array.reshape(voxels, *array.shape[3:])[jnp.minimum(target, voxels - 1)].astype(jnp.float32)
-        for array in (grid.hits, grid.weight, grid.mean, grid.axes)
+        for array in (grid.hits, grid.weight, grid.surface.mean, grid.surface.axes)
     )
     old_spread = jnp.einsum("nki,nkj->nij", old_axes, old_axes)
     part = new_weight / jnp.maximum(old_weight + new_weight, 1e-30)
@@ -102,8 +105,9 @@ def fuse_hits(
     return grid.replace(
         hits=put(grid.hits, old_hits + new_hits),
         weight=put(grid.weight, old_weight + new_weight),
-        mean=put(grid.mean, mean),
-        axes=put(grid.axes, axes),
+        surface=grid.surface.replace(
+            mean=put(grid.surface.mean, mean), axes=put(grid.surface.axes, axes)
+        ),
     )
 
 
@@ -121,6 +125,19 @@ def is_feature(config: Config, hits: jax.Array, passes: jax.Array) -> jax.Array:
     return (hits >= config.min_hits) & (hits >= config.min_hit_ratio * (hits + passes))
 
 
+def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
+    """Tells the voxels that may hold a surface: features, and those that are nearly ones.
+
+    Args:
+        hits: (...) rays that ended in the voxel.
+        passes: (...) rays that went through it.
+
+    Returns:
+        (...) bool.
+    """
+    return (hits > 0) & (hits >= _DOUBT_RATIO * (hits + passes))
+
+
 def patch_offset(point: jax.Array, mean: jax.Array, axes: jax.Array) -> jax.Array:
     """Vector from the nearest point of a patch to a point.
 
@@ -130,7 +147,7 @@ def patch_offset(point: jax.Array, mean: jax.Array, axes: jax.Array) -> jax.Arra
     Args:
         point: (..., 3), voxels.
         mean: (..., 3) centre of the patch, same frame and unit.
-        axes: (..., 3, 3) principal axes as in `Grid.axes`, voxels.
+        axes: (..., 3, 3) principal axes as in `Surface.axes`, voxels.
 
     Returns:
         (..., 3) voxels; its length is the distance.

@@ -1,0 +1,69 @@
+"""How far the map errs to the free side, measured at every update against what comes next.
+
+The newest returns lie on surfaces: where the map so far had seen their voxel it should answer 0
+there, or less. How much more it answers, in units of its own error scale (`served.cautious_sdf`),
+is its optimism; a high quantile of it over the returns, averaged over updates, gives the lower
+bound of the distance, lower = cautious - optimism * scale.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax import served
+from hiosdf_jax.grid import lookup
+from hiosdf_jax.samples import draw_from_mask
+from hiosdf_jax.state import Field
+
+# Of the newest returns. They are the hardest points there are, and seen for the first time by
+# definition where a view opens: the bound that holds for 95 % of them holds for 99.3 % to 99.5 %
+# of the points of free space (LiDAR, depth).
+_QUANTILE = 0.95
+_RETURNS = 2000  # looked at in an update
+_LEAST_RETURNS = 100  # fewer tell nothing of a quantile
+_MEMORY = 0.98  # share of the old value in the average over updates
+_INITIAL = 3.0
+
+
+def initial() -> jax.Array:
+    """The optimism of a map that has not been tested yet, ()."""
+    return jnp.float32(_INITIAL)
+
+
+def lower_bound(field: Field, points_world: jax.Array) -> jax.Array:
+    """A lower bound of the true distance at seen points.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) m.
+    """
+    cautious, scale = served.cautious_sdf(field, points_world)
+    return cautious - field.optimism * scale
+
+
+def calibrate(field: Field, points_world: jax.Array, ends: jax.Array, key: jax.Array) -> jax.Array:
+    """Compares the map so far with the newest cloud.
+
+    Args:
+        field: The map, before the cloud is fused.
+        points_world: (N, 3) m, returns of the cloud.
+        ends: (N,) bool, the returns to be looked at, inside the bounds.
+        key: Source of randomness.
+
+    Returns:
+        () float32, the new optimism.
+    """
+    chosen, possible = draw_from_mask(ends, _RETURNS, key)
+    points_world = jnp.where(possible, points_world[chosen], field.origin_world)
+    seen = possible & (lookup.frontier(field.config, field.surface, points_world) > 0)
+    cautious, scale = served.cautious_sdf(field, points_world)
+    ratio = jnp.where(seen, cautious / scale, jnp.nan)
+    newest = jnp.nanquantile(ratio, _QUANTILE)
+    memory = jnp.minimum(_MEMORY, field.updates / (field.updates + 1.0))
+    mixed = memory * field.optimism + (1 - memory) * newest
+    enough = jnp.sum(seen) >= _LEAST_RETURNS
+    return jnp.maximum(jnp.where(enough, mixed, field.optimism), 0)

@@ -1,0 +1,60 @@
+"""A box-shaped room, a sensor that looks around in it, and a map that is small enough for tests."""
+
+import numpy as np
+
+import hiosdf_jax as hio
+
+BOUNDS = ((-1.2, -1.0, -0.8), (1.2, 1.0, 0.8))
+CONFIG = hio.Config.light(
+    BOUNDS,
+    max_points=300,
+    max_range=4.0,
+    distance_horizon=1.0,
+    near_samples=400,
+    far_samples=400,
+    local_points=20,
+    local_ray_samples=5,
+    hidden_width=16,
+    hidden_layers=1,
+    batches=2,
+    warmup_updates=2,
+    warmup_epochs=4,
+)
+
+
+# Not on faces of voxels, where rounding decides which voxel a return falls in.
+HALF = np.array([0.97, 0.78, 0.56])
+
+
+def room_cloud(seed, count=250, yaw=0.0, position=(0.0, 0.0, 0.0)):
+    """Exact returns of a sensor inside the box |x, y, z| < HALF."""
+    rng = np.random.default_rng(seed)
+    rays = rng.normal(size=(count, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    pose = np.eye(4, dtype=np.float32)
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = position
+    world_rays = rays @ pose[:3, :3].T
+    reach = (HALF * np.sign(world_rays) - position) / world_rays
+    cloud = rays * reach.min(axis=1, keepdims=True)
+    return cloud.astype(np.float32), pose
+
+
+def stream(frames=4, count=250):
+    return [
+        room_cloud(i, count, 0.3 * i, (0.1 * i - 0.2, 0.05 * i, 0.02 * i)) for i in range(frames)
+    ]
+
+
+def room_sdf(points):
+    """Exact distance to the room's walls for points inside, m."""
+    return (HALF - np.abs(points)).min(axis=-1)
+
+
+def map_of_room(config, key, frames=4, count=250):
+    """The map after some frames."""
+    state = hio.init(config, key)
+    for cloud, pose in stream(frames, count):
+        state = hio.update(state, cloud, pose)
+    return state
