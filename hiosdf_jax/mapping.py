@@ -169,7 +169,9 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     _, _, inside = geometry.voxel_of(config, points_world)
 
     # How well the map so far foretold the newest cloud.
-    optimism = uncertainty.calibrate(field_of(state), points_world, ends & inside, check_key)
+    optimism = uncertainty.calibrate(
+        field_of(state), points_world, ends & inside, sensor_world, check_key
+    )
 
     # The coarse grid (paper, IV-B).
     grid = _with_evidence_as(state.grid, jnp.float32)
@@ -255,14 +257,15 @@ def _with_evidence_as(grid: Grid, dtype: Any) -> Grid:
     )
 
 
-def _is_rigid(pose: jax.Array) -> jax.Array:
+def _is_rigid(pose: Any, np: Any = jnp) -> Any:
+    """() bool; with numpy for a pose outside jit, which costs no dispatches to a device."""
     rotation = pose[:3, :3]
     # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
-    gram = jnp.sum(rotation[:, :, None] * rotation[:, None, :], axis=0)
-    handed = jnp.dot(jnp.cross(rotation[0], rotation[1]), rotation[2], precision="highest")
-    orthonormal = jnp.all(jnp.abs(gram - jnp.eye(3)) <= _RIGID_TOLERANCE)
-    last_row = jnp.all(jnp.abs(pose[3] - jnp.array([0.0, 0, 0, 1])) <= 1e-6)
-    return orthonormal & last_row & (handed > 0) & jnp.all(jnp.isfinite(pose))
+    gram = np.sum(rotation[:, :, None] * rotation[:, None, :], axis=0)
+    handed = np.sum(np.cross(rotation[0], rotation[1]) * rotation[2])
+    orthonormal = np.all(np.abs(gram - np.eye(3)) <= _RIGID_TOLERANCE)
+    last_row = np.all(np.abs(pose[3] - np.array([0.0, 0, 0, 1])) <= 1e-6)
+    return orthonormal & last_row & (handed > 0) & np.all(np.isfinite(pose))
 
 
 def _check_shapes(cloud: Any, pose: Any) -> None:
@@ -275,9 +278,9 @@ def _check_shapes(cloud: Any, pose: Any) -> None:
 def _check_values(cloud: np.ndarray, pose: np.ndarray) -> None:
     if not np.isfinite(pose).all():
         raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
-    if not bool(_is_rigid(jnp.asarray(pose))):
+    if not _is_rigid(pose, np):
         raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
-    if not np.isfinite(cloud).all(axis=1).any():
+    if not _finite_rows(cloud).any():
         raise ValueError(
             f"cloud has no finite row among its {len(cloud)}, expected at least one return"
         )
@@ -285,16 +288,24 @@ def _check_values(cloud: np.ndarray, pose: np.ndarray) -> None:
 
 def _to_capacity(cloud: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
     """Pads a cloud with NaN rows, or draws from its finite rows, to (capacity, 3)."""
-    if len(cloud) > capacity:
-        cloud = cloud[np.isfinite(cloud).all(axis=1)]
-    if len(cloud) > capacity:
-        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
-        seed = zlib.crc32(pose.tobytes(), len(cloud))
-        rows = np.random.default_rng(seed).choice(len(cloud), capacity, replace=False)
-        cloud = cloud[np.sort(rows)]
     padded = np.full((capacity, 3), np.nan, np.float32)
-    padded[: len(cloud)] = cloud
+    if len(cloud) <= capacity:
+        padded[: len(cloud)] = cloud
+        return padded
+    rows = np.flatnonzero(_finite_rows(cloud))
+    if len(rows) > capacity:
+        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
+        seed = zlib.crc32(pose.tobytes(), len(rows))
+        lot = np.random.default_rng(seed).integers(0, 2**32, len(rows), np.uint32)
+        least = np.partition(lot, capacity - 1)[capacity - 1]
+        rows = rows[lot <= least][:capacity]  # equal lots may make them a few more
+    padded[: len(rows)] = cloud.take(rows, axis=0)
     return padded
+
+
+def _finite_rows(cloud: np.ndarray) -> np.ndarray:
+    finite = np.isfinite(cloud)
+    return finite[:, 0] & finite[:, 1] & finite[:, 2]  # several times faster than all(axis=1)
 
 
 def _typed_key(key: Any) -> jax.Array:

@@ -43,15 +43,36 @@ def cosine(x: jax.Array) -> jax.Array:
     return _sine_of_half_turns(x * (1 / np.pi) + 0.5)
 
 
-def _sine_of_half_turns(turns: jax.Array) -> jax.Array:
+def sine_and_cosine(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Both, from one range reduction; to be given a derivative by whoever calls.
+
+    Args:
+        x: Any shape, radians, float32.
+
+    Returns:
+        sin(x) and cos(x), as exact as `sine`.
+    """
+    turns = x * (1 / np.pi)
     whole = jnp.floor(turns + 0.5)
     rest = turns - whole
-    square = rest * rest
+    sign = 1 - 2 * (whole - 2 * jnp.floor(whole * 0.5))
+    # cos(pi r) = sin(pi (1/2 - |r|)): the same polynomial serves both.
+    return sign * _polynomial(rest), sign * _polynomial(0.5 - jnp.abs(rest))
+
+
+def _sine_of_half_turns(turns: jax.Array) -> jax.Array:
+    whole = jnp.floor(turns + 0.5)
+    odd = whole - 2 * jnp.floor(whole * 0.5)
+    return _polynomial(turns - whole) * (1 - 2 * odd)
+
+
+def _polynomial(half_turns: jax.Array) -> jax.Array:
+    """sin(pi x) for |x| <= 1/2."""
+    square = half_turns * half_turns
     value = jnp.full_like(square, _COEFFICIENTS[-1])
     for coefficient in _COEFFICIENTS[-2::-1]:
         value = value * square + coefficient
-    odd = whole - 2 * jnp.floor(whole * 0.5)
-    return value * rest * (1 - 2 * odd)
+    return value * half_turns
 
 
 @sine.defjvp

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax.config import Config
+from hiosdf_jax.network import passes
 from hiosdf_jax.network.sine import sine
 
 
@@ -52,6 +55,7 @@ def init_params(config: Config, key: jax.Array) -> Any:
     return siren(config).init(key, jnp.zeros((1, 3)))
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
     """Evaluates the network.
 
@@ -61,11 +65,21 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
         points: (..., 3) m, relative to the network's origin.
 
     Returns:
-        (...) m.
+        (...) m. Differentiable any number of times.
     """
-    return jnp.asarray(siren(config).apply(params, points))
+    return passes.value(config.frequency, params, points)
 
 
+@functools.partial(predict.defjvp, symbolic_zeros=True)
+def _predict_jvp(config: Config, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    (params, points), (by_params, by_points) = primals, tangents
+    if not _all_zero(by_params):
+        return jax.jvp(siren(config).apply, primals, _instantiate(primals, tangents))
+    value, gradient = predict_with_gradient(config, params, points)
+    return value, jnp.sum(gradient * _instantiate(points, by_points), axis=-1)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def predict_with_gradient(
     config: Config, params: Any, points: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -77,10 +91,32 @@ def predict_with_gradient(
         points: (..., 3) m, relative to the network's origin.
 
     Returns:
-        The values (...) m and their gradients (..., 3).
+        The values (...) m and their gradients (..., 3). Differentiable any number of times.
     """
-    value, pull = jax.vjp(lambda x: predict(config, params, x), points)
-    return value, pull(jnp.ones_like(value))[0]
+    return passes.value_and_gradient(config.frequency, params, points)
+
+
+@predict_with_gradient.defjvp
+def _predict_with_gradient_jvp(config: Config, primals: Any, tangents: Any) -> Any:
+    def plain(params: Any, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value, pull = jax.vjp(lambda x: jnp.asarray(siren(config).apply(params, x)), points)
+        return value, pull(jnp.ones_like(value))[0]
+
+    return jax.jvp(plain, primals, tangents)
+
+
+def _all_zero(tangents: Any) -> bool:
+    return all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents))
+
+
+def _instantiate(primals: Any, tangents: Any) -> Any:
+    return jax.tree.map(
+        lambda primal, tangent: (
+            jnp.zeros_like(primal) if isinstance(tangent, SymbolicZero) else tangent
+        ),
+        primals,
+        tangents,
+    )
 
 
 def shift_output(config: Config, params: Any, amount: jax.Array) -> Any:

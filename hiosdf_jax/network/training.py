@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.network import siren
+from hiosdf_jax.network import passes, siren
 from hiosdf_jax.samples import Samples
 from hiosdf_jax.state import Network
 
@@ -46,26 +47,28 @@ def init_network(config: Config, key: jax.Array) -> Network:
 
 
 def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """Computes the losses over samples.
+    """Computes the losses over samples, the Eikonal one over the first of them.
 
     Args:
         config: The map's configuration.
         params: The network's weights.
         points: (N, 3) the samples' points relative to the network's origin, m.
-        samples: The samples.
+        samples: The samples, in random order but for that.
 
     Returns:
         Their means over the samples with weight.
     """
-    every = config.eikonal_every
-    value = siren.predict(config, params, points)
-    _, gradient = siren.predict_with_gradient(config, params, points[::every])
+    sloped = -(-points.shape[0] // config.eikonal_every)
+    value, gradient = passes.value_and_gradient(config.frequency, params, points[:sloped])
+    if sloped < points.shape[0]:
+        others = passes.value(config.frequency, params, points[sloped:])
+        value = jnp.concatenate([value, others])
     # Not a safe norm: where the gradient is 0 its direction is undefined anyway, and 1e-12 is
     # enough to keep the derivative finite.
     slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + 1e-12)
     return Losses(
         _mean(jnp.abs(value - samples.sdf), samples.weight),
-        _mean(jnp.abs(slope - 1), samples.weight[::every]),
+        _mean(jnp.abs(slope - 1), samples.weight[:sloped]),
     )
 
 
@@ -93,15 +96,19 @@ def train(
     """
     optimizer = _optimizer(config)
     batches = _split(config, samples, key)
+    # A sum instead of a mean: single samples' shares would vanish in float16.
+    scale = batches.sdf.shape[1]
 
     def objective(params: Any, batch: Samples) -> tuple[jax.Array, Losses]:
         points = batch.points_world - network.origin_world
         parts = losses(config, params, points, batch)
-        return config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal, parts
+        loss = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
+        return loss * scale, parts
 
     def step(carry: tuple[Any, Any], batch: Samples) -> tuple[tuple[Any, Any], Losses]:
         params, state = carry
         gradients, parts = jax.grad(objective, has_aux=True)(params, batch)
+        gradients = jax.tree.map(lambda gradient: gradient / scale, gradients)
         updates, state = optimizer.update(gradients, state, params)
         return (optax.apply_updates(params, updates), state), parts
 
@@ -127,12 +134,16 @@ def train(
 
 
 def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
-    """Shuffles samples into (batches, size) parts; what does not fill a part is left out."""
+    """Shuffles samples into (batches, size) parts; what does not fill a part is left out.
+
+    A single part needs no chance: one sample in `eikonal_every` comes first.
+    """
     count = samples.sdf.shape[0]
     size = count // config.batches
     if config.batches == 1:
-        return jax.tree.map(lambda array: array[None], samples)
-    order = jax.random.permutation(key, count)[: size * config.batches]
+        order = np.argsort(np.arange(count) % config.eikonal_every > 0, kind="stable")
+    else:
+        order = jax.random.permutation(key, count)[: size * config.batches]
     return jax.tree.map(
         lambda array: array[order].reshape(config.batches, size, *array.shape[1:]), samples
     )
