@@ -1,5 +1,6 @@
 """Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463)."""
 
+from hiosdf_jax.background import BackgroundMapper
 from hiosdf_jax.bake import bake
 from hiosdf_jax.checkpoint import load, save
 from hiosdf_jax.config import Config
@@ -9,6 +10,7 @@ from hiosdf_jax.query import query, sdf, sdf_and_grad
 from hiosdf_jax.state import Baked, Field, Flag, MapState, Query, Report
 
 __all__ = [
+    "BackgroundMapper",
     "Baked",
     "Config",
     "Field",
