@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from hiosdf_jax.config import Config
     from hiosdf_jax.datasets import Stream
+    from hiosdf_jax.evaluation import GroundTruth
 
 _NOTHING_MAPPED, _BAD_INPUT = 1, 2  # exit codes; argparse itself exits with 2
 _SKIP_HINT = " (--skip-bad-frames goes on without such frames)"
@@ -93,7 +94,7 @@ def _map(options: argparse.Namespace) -> None:
     chosen = {name: value for name, value in chosen.items() if value is not None}
     stream = _checked(lambda: datasets.open_stream(options.stream, options.format, **chosen))
     truth = None
-    if isinstance(stream, datasets.NpzStream):
+    if isinstance(stream, datasets.NpzStream) and options.ground_truth is None:
         truth = _checked(lambda: datasets.ground_truth(options.stream))
     if options.frames is not None:
         stream = _First(stream, options.frames)
@@ -112,6 +113,9 @@ def _map(options: argparse.Namespace) -> None:
             f"bounds x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}, z {z0:.1f} to {z1:.1f} m; "
             f"returns up to {max_range:.1f} m"
         )
+    exact_sdf = None
+    if options.ground_truth is not None:
+        truth, exact_sdf = _ground_truth(options.ground_truth, stream, max_range)
     overrides = {"max_range": max_range}
     if options.voxel_size is not None:
         overrides["voxel_size"] = options.voxel_size
@@ -123,9 +127,22 @@ def _map(options: argparse.Namespace) -> None:
         name=place.name,
         seed=options.seed,
         truth=truth,
+        exact_sdf=exact_sdf,
         save_path=options.save,
         skip_bad_frames=options.skip_bad_frames,
     )
+
+
+def _ground_truth(
+    file: Path, stream: Stream, max_range: float
+) -> tuple[GroundTruth, Callable[[np.ndarray], np.ndarray]]:
+    """Exact distances where the stream has seen, and anywhere."""
+    from hiosdf_jax import ground_truth
+
+    rays = _checked(lambda: ground_truth.read_rays(stream, max_range), code=_NOTHING_MAPPED)
+    scene = _checked(lambda: ground_truth.read_scene(file, ground_truth.sensor_path(rays)))
+    truth = _checked(lambda: ground_truth.sample_visible(scene, rays))
+    return truth, lambda points_world: scene.sdf_and_grad(points_world)[0]
 
 
 def _configure(name: str, bounds: Any, **overrides: float) -> Config:
@@ -208,9 +225,10 @@ def _parser() -> argparse.ArgumentParser:
         "map",
         parents=[common],
         help="map a recorded stream",
-        description="Maps a recorded stream, scores the map and draws it. A stream without exact "
-        "distances (eval_*) is scored on frames that the map is not given. A frame that cannot be "
-        "used ends the mapping with exit code 2; what came before it is written all the same.",
+        description="Maps a recorded stream, scores the map and draws it. Without exact distances "
+        "(eval_* of an .npz file, or --ground-truth) it is scored on frames that the map is not "
+        "given. A frame that cannot be used ends the mapping with exit code 2; what came before it "
+        "is written all the same.",
     )
     map_.add_argument(
         "stream",
@@ -270,6 +288,13 @@ def _parser() -> argparse.ArgumentParser:
         help="farther returns leave no surface (default: found in the first pass)",
     )
     map_.add_argument("--frames", type=_whole(1), metavar="N", help="only the first N frames")
+    map_.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="FILE",
+        help="score against the scene itself: a triangle mesh in the stream's world frame and in "
+        "metres, or a folder with sdf.npy and transform.txt as of iSDF",
+    )
     map_.add_argument("--save", type=Path, metavar="FILE", help="write the map, for hio.load")
     map_.set_defaults(command=_map)
     return parser

@@ -6,7 +6,7 @@ scores our map, a baked field, a plain grid or somebody else's method.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,15 +14,40 @@ import numpy as np
 # One batch shape for every call: a jitted map compiles once. Small enough that the activations of
 # a wide network stay in tens of megabytes on a CPU, large enough to keep a GPU busy.
 _CHUNK = 8192
-_NEAR = 0.5  # m, "near" in near_cm
+_NEAR = 0.5  # m, "near" in near_cm and near_bias_cm
 _LOCAL_RADIUS = 3.0  # m, the paper's local SDF error
 _RADIUS_BOUNDS = (0.05, 0.4)  # m, robot spheres from a gripper's finger to a mobile base
+_KEPT = 0.02  # m, a point of a thin part whose |sdf| is more than this has been lost
+_THIN_RETURNS = 10  # that a thin part needs to count
+_THIN_POINTS = 50  # at most so many points of each part, so that a leg counts as much as a shelf
+_BANDS = {  # of the true distance, m: least (in the band), upper end (not in it)
+    "0-5 cm": (0.0, 0.05),
+    "5-20 cm": (0.05, 0.2),
+    "20-50 cm": (0.2, 0.5),
+    ">50 cm": (0.5, np.inf),
+}
 
-_METRICS = {  # key: (label, unit, which is better)
+
+class Metric(NamedTuple):
+    """What a score means.
+
+    Attributes:
+        label: In words.
+        unit: "cm", or "-" for none.
+        better: "lower", "higher" or "nearer 0".
+    """
+
+    label: str
+    unit: str
+    better: str
+
+
+_METRICS = {
     "visible_cm": ("error, visible region", "cm", "lower"),
     "near_cm": ("error within 0.5 m of a surface", "cm", "lower"),
     "within_3m_cm": ("error within 3 m of the sensor", "cm", "lower"),
     "bias_cm": ("bias, map - truth", "cm", "nearer 0"),
+    "near_bias_cm": ("bias within 0.5 m of a surface", "cm", "nearer 0"),
     "surface_cm": ("|sdf| on the surface", "cm", "lower"),
     "median_cm": ("|sdf| on held-out returns, median", "cm", "lower"),
     "mean_cm": ("|sdf| on held-out returns, mean", "cm", "lower"),
@@ -31,7 +56,11 @@ _METRICS = {  # key: (label, unit, which is better)
     "cosine": ("1 - cos(grad, true grad)", "-", "lower"),
     "recall": ("collisions found", "-", "higher"),
     "fpr": ("free spheres called colliding", "-", "lower"),
+    "thin_share": ("thin parts kept within 2 cm", "-", "higher"),
+    "early_then_cm": ("error where the first frames saw, after them", "cm", "lower"),
+    "early_now_cm": ("error where the first frames saw, at the end", "cm", "lower"),
 }
+METRICS = {key: Metric(*meaning) for key, meaning in _METRICS.items()}
 
 
 class GroundTruth(NamedTuple):
@@ -43,6 +72,8 @@ class GroundTruth(NamedTuple):
         grad: (N, 3) float32; exact unit gradient of the distance, d(sdf)/d(point).
         frame: (N,) int32; the frame in which the point was first sampled.
         surface_points_world: (M, 3) float32, metres; exact surface points that the sensor saw.
+        thin_points_world: (K, 3) float32, metres; exact surface points that the sensor saw of parts
+            less than 5 cm thick; empty where nobody has told such parts from others.
     """
 
     points_world: np.ndarray
@@ -50,6 +81,19 @@ class GroundTruth(NamedTuple):
     grad: np.ndarray
     frame: np.ndarray
     surface_points_world: np.ndarray
+    thin_points_world: np.ndarray = np.empty((0, 3), np.float32)
+
+
+class _Answers(NamedTuple):
+    """A map's answers beside the truth, at the points that count."""
+
+    points_world: np.ndarray
+    sdf_true: np.ndarray
+    sdf_map: np.ndarray
+    eikonal: np.ndarray  # | |grad| - 1 |
+    cosine: np.ndarray  # 1 - cos(grad, true grad)
+    radius: np.ndarray  # m, of the sphere that stands at the point
+    complete: bool  # no frame is left out
 
 
 def evaluate(
@@ -74,65 +118,68 @@ def evaluate(
     Returns:
         `visible_cm` mean absolute error; `near_cm` the same where the true distance is < 0.5 m;
         `within_3m_cm` the same within 3 m of the sensor (only with `sensor_position_world`);
-        `bias_cm` mean of map - truth; `surface_cm` mean |sdf| on surface points; `eikonal` mean of
+        `bias_cm` mean of map - truth; `near_bias_cm` the same where the true distance is < 0.5 m;
+        `surface_cm` mean |sdf| on surface points; `eikonal` mean of
         | |grad| - 1 |; `cosine` mean of 1 - cos(grad, true grad), 1 where a gradient is zero;
         `recall` and `fpr` of "a sphere collides when the distance at its centre < its radius",
-        for spheres of 0.05 to 0.4 m radius (drawn from one fixed seed) centred on the points.
+        for spheres of 0.05 to 0.4 m radius (drawn from one fixed seed) centred on the points;
+        `thin_share` share of the points on thin parts where |sdf| <= 2 cm (only if truth has such
+        points and no frame is left out).
 
     Raises:
         ValueError: Truth is misshapen, no point has frame <= last_frame, the sensor position is not
             (3,), or the map's answers have the wrong shape.
     """
-    points, sdf_true, grad_true, frame, surface = (np.asarray(field) for field in truth)
-    count = len(points)
-    for name, array, shape in (
-        ("points_world", points, (count, 3)),
-        ("sdf", sdf_true, (count,)),
-        ("grad", grad_true, (count, 3)),
-        ("frame", frame, (count,)),
-        ("surface_points_world", surface, (len(surface), 3)),
-    ):
-        if array.shape != shape:
-            raise ValueError(f"truth.{name} has shape {array.shape}, expected {shape}")
-
-    # Drawn for all points before any are dropped, so that a point keeps its sphere.
-    radius = np.random.default_rng(1).uniform(*_RADIUS_BOUNDS, count)
-    selected = np.full(count, True) if last_frame is None else frame <= last_frame
-    if not selected.any():
-        raise ValueError(
-            f"last_frame = {last_frame} leaves none of the {count} points of truth; "
-            f"expected last_frame >= {frame.min() if count else 0} and a truth with points"
-        )
-    complete = bool(selected.all())
-    points, radius = points[selected], radius[selected]
-    sdf_true, grad_true = sdf_true[selected].astype(float), grad_true[selected].astype(float)
-
-    sdf_map, grad_map = _in_chunks(sdf_and_grad, points)
-    error = sdf_map - sdf_true
-    norm_map = np.linalg.norm(grad_map, axis=-1)
-    norm_product = norm_map * np.linalg.norm(grad_true, axis=-1)
-    cosine = np.sum(grad_map * grad_true, axis=-1) / np.where(norm_product == 0, 1, norm_product)
-    collides = sdf_true < radius
-    called = np.where(np.isnan(sdf_map), np.nan, sdf_map < radius)
-
-    scores = {
-        "visible_cm": 100 * _mean(np.abs(error)),
-        "near_cm": 100 * _mean(np.abs(error[sdf_true < _NEAR])),
-    }
-    if sensor_position_world is not None:
-        sensor = np.asarray(sensor_position_world, float)
-        if sensor.shape != (3,):
-            raise ValueError(f"sensor_position_world has shape {sensor.shape}, expected (3,)")
-        local = np.linalg.norm(points - sensor, axis=-1) < _LOCAL_RADIUS
-        scores["within_3m_cm"] = 100 * _mean(np.abs(error[local]))
-    surface_error = np.abs(_in_chunks(sdf_and_grad, surface)[0]) if complete else np.empty(0)
-    return scores | {
+    answers = _ask(sdf_and_grad, truth, last_frame)
+    error = answers.sdf_map - answers.sdf_true
+    near = answers.sdf_true < _NEAR
+    everywhere = np.full(len(error), True)
+    paper = _paper_metrics(answers, everywhere, sensor_position_world)
+    collides = answers.sdf_true < answers.radius
+    called = np.where(np.isnan(answers.sdf_map), np.nan, answers.sdf_map < answers.radius)
+    # Points on surfaces carry no frame.
+    surface = truth.surface_points_world if answers.complete else np.empty((0, 3))
+    scores = paper | {
+        "near_cm": 100 * _mean(np.abs(error[near])),
         "bias_cm": 100 * _mean(error),
-        "surface_cm": 100 * _mean(surface_error),
-        "eikonal": _mean(np.abs(norm_map - 1)),
-        "cosine": _mean(1 - cosine),
+        "near_bias_cm": 100 * _mean(error[near]),
+        "surface_cm": 100 * _mean(np.abs(_in_chunks(sdf_and_grad, surface)[0])),
         "recall": _mean(called[collides]),
         "fpr": _mean(called[~collides]),
+    }
+    if answers.complete and len(truth.thin_points_world):
+        thin = _in_chunks(sdf_and_grad, truth.thin_points_world)[0]
+        scores["thin_share"] = _mean(np.where(np.isnan(thin), np.nan, np.abs(thin) <= _KEPT))
+    return {key: scores[key] for key in METRICS if key in scores}
+
+
+def evaluate_bands(
+    sdf_and_grad: Callable[[np.ndarray], tuple[Any, Any]],
+    truth: GroundTruth,
+    sensor_position_world: Any | None = None,
+    last_frame: int | None = None,
+) -> dict[str, dict[str, float]]:
+    """Scores a map by the paper's four metrics, near surfaces and far from them apart.
+
+    Args:
+        sdf_and_grad: As for `evaluate`.
+        truth: As for `evaluate`.
+        sensor_position_world: As for `evaluate`.
+        last_frame: As for `evaluate`.
+
+    Returns:
+        {band: scores}; the bands are of the true distance, "0-5 cm", "5-20 cm", "20-50 cm" and
+        ">50 cm" (the nearer end belongs to a band); the scores are `visible_cm`, `within_3m_cm`
+        (only with `sensor_position_world`), `eikonal` and `cosine`, as of `evaluate`.
+
+    Raises:
+        ValueError: As of `evaluate`.
+    """
+    answers = _ask(sdf_and_grad, truth, last_frame)
+    distance = np.abs(answers.sdf_true)
+    return {
+        band: _paper_metrics(answers, (low <= distance) & (distance < high), sensor_position_world)
+        for band, (low, high) in _BANDS.items()
     }
 
 
@@ -165,6 +212,27 @@ def held_out_surface(
     }
 
 
+def choose_thin(part: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Chooses among returns those that tell whether thin parts are in a map.
+
+    Args:
+        part: (R,) int, number of the thin part that each return is from; -1 for anything else.
+        rng: Source of randomness.
+
+    Returns:
+        (K,) indices of returns: up to 50 of each part that has at least 10.
+    """
+    order = np.argsort(part, kind="stable")
+    order = order[part[order] >= 0]
+    _, starts = np.unique(part[order], return_index=True)
+    chosen = [
+        rng.choice(rows, min(len(rows), _THIN_POINTS), replace=False)
+        for rows in np.split(order, starts[1:])
+        if len(rows) >= _THIN_RETURNS
+    ]
+    return np.concatenate([np.empty(0, int), *chosen])
+
+
 def format_table(
     scores: Mapping[str, float], peers: Mapping[str, Mapping[str, Any]] | None = None
 ) -> str:
@@ -179,23 +247,129 @@ def format_table(
         The table, one metric a row with its unit and which direction is better, then ours, then the
         peers. A dash stands for "no value".
     """
-    rows = [key for key in _METRICS if key in scores]
+    rows = [key for key in METRICS if key in scores]
     columns: dict[str, Mapping[str, Any]] = {"ours": scores}
     columns |= {name: peer for name, peer in (peers or {}).items() if any(r in peer for r in rows)}
     cells = [["metric", "unit", "better", *columns]]
     for key in rows:
-        decimals = 2 if key.endswith("_cm") else 3
-        values = [_cell(column.get(key), decimals) for column in columns.values()]
-        cells.append([*_METRICS[key], *values])
+        cells.append(
+            [*METRICS[key], *(format_score(key, each.get(key)) for each in columns.values())]
+        )
+    return lay_out(cells, text_columns=3)
+
+
+def format_bands(bands: Mapping[str, Mapping[str, float]]) -> str:
+    """Lays scores by band of the true distance out as a table for a terminal.
+
+    Args:
+        bands: What `evaluate_bands` returned.
+
+    Returns:
+        The table, one band a row, one metric a column.
+    """
+    keys = [key for key in METRICS if any(key in scores for scores in bands.values())]
+    cells = [["true distance", *keys]]
+    for band, scores in bands.items():
+        cells.append([band, *(format_score(key, scores.get(key)) for key in keys)])
+    return lay_out(cells, text_columns=1)
+
+
+def format_score(key: str, value: Any) -> str:
+    """Writes a score as in all tables.
+
+    Args:
+        key: One of `METRICS`.
+        value: The score, None, or several of which the mean is taken.
+
+    Returns:
+        Two decimals of centimetres, three of anything else; a dash for no value or NaN.
+    """
+    if value is None or not np.isfinite(np.mean(value)):
+        return "-"
+    return f"{np.mean(value):.{2 if METRICS[key].unit == 'cm' else 3}f}"
+
+
+def lay_out(cells: Sequence[Sequence[str]], text_columns: int) -> str:
+    """Aligns a table, with a line under its first row.
+
+    Args:
+        cells: Rows of the same length, the first of them the headings.
+        text_columns: The first so many columns are text, aligned left; the rest are numbers.
+
+    Returns:
+        The table, without a line break at its end.
+    """
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     lines = [
         "  ".join(
-            cell.ljust(width) if i < 3 else cell.rjust(width)  # text left, numbers right
+            cell.ljust(width) if i < text_columns else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in cells
     ]
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+def _ask(
+    sdf_and_grad: Callable[[np.ndarray], tuple[Any, Any]],
+    truth: GroundTruth,
+    last_frame: int | None,
+) -> _Answers:
+    """Queries a map at the points of truth up to a frame."""
+    points, sdf_true, grad_true, frame, surface, thin = (np.asarray(field) for field in truth)
+    count = len(points)
+    for name, array, shape in (
+        ("points_world", points, (count, 3)),
+        ("sdf", sdf_true, (count,)),
+        ("grad", grad_true, (count, 3)),
+        ("frame", frame, (count,)),
+        ("surface_points_world", surface, (len(surface), 3)),
+        ("thin_points_world", thin, (len(thin), 3)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"truth.{name} has shape {array.shape}, expected {shape}")
+
+    # Drawn for all points before any are dropped, so that a point keeps its sphere.
+    radius = np.random.default_rng(1).uniform(*_RADIUS_BOUNDS, count)
+    selected = np.full(count, True) if last_frame is None else frame <= last_frame
+    if not selected.any():
+        raise ValueError(
+            f"last_frame = {last_frame} leaves none of the {count} points of truth; "
+            f"expected last_frame >= {frame.min() if count else 0} and a truth with points"
+        )
+    points, grad_true = points[selected], grad_true[selected].astype(float)
+    sdf_map, grad_map = _in_chunks(sdf_and_grad, points)
+    norm_map = np.linalg.norm(grad_map, axis=-1)
+    norm_product = norm_map * np.linalg.norm(grad_true, axis=-1)
+    cosine = np.sum(grad_map * grad_true, axis=-1) / np.where(norm_product == 0, 1, norm_product)
+    return _Answers(
+        points_world=points,
+        sdf_true=sdf_true[selected].astype(float),
+        sdf_map=sdf_map,
+        eikonal=np.abs(norm_map - 1),
+        cosine=1 - cosine,
+        radius=radius[selected],
+        complete=bool(selected.all()),
+    )
+
+
+def _paper_metrics(
+    answers: _Answers, chosen: np.ndarray, sensor_position_world: Any | None
+) -> dict[str, float]:
+    """The four metrics of the paper's section V-B over the chosen points, (n,) bool."""
+    error = np.abs(answers.sdf_map - answers.sdf_true)
+    scores = {
+        "visible_cm": 100 * _mean(error[chosen]),
+        "eikonal": _mean(answers.eikonal[chosen]),
+        "cosine": _mean(answers.cosine[chosen]),
+    }
+    if sensor_position_world is not None:
+        sensor = np.asarray(sensor_position_world, float)
+        if sensor.shape != (3,):
+            raise ValueError(f"sensor_position_world has shape {sensor.shape}, expected (3,)")
+        local = np.linalg.norm(answers.points_world - sensor, axis=-1) < _LOCAL_RADIUS
+        scores["within_3m_cm"] = 100 * _mean(error[chosen & local])
+    return scores
 
 
 def _in_chunks(
@@ -221,9 +395,3 @@ def _in_chunks(
 
 def _mean(values: np.ndarray) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
-
-
-def _cell(value: Any, decimals: int) -> str:
-    if value is None or not np.isfinite(np.mean(value)):
-        return "-"
-    return f"{np.mean(value):.{decimals}f}"

@@ -123,8 +123,7 @@ def run_stream(
     output = Path(output)
     output.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    frames = range(len(stream))
-    held_out = frames[_FIRST_HELD_OUT::_HOLD_OUT_EVERY] if truth is None else range(0)
+    held_out = held_out_frames(len(stream)) if truth is None else range(0)
     mapped = map_frames(
         stream, config, jax.random.key(seed), held_out=held_out, skip_bad_frames=skip_bad_frames
     )
@@ -134,12 +133,13 @@ def run_stream(
 
     metrics = _describe(mapped, config) | {"stream": name, "seed": seed}
     if truth is not None:
-        metrics["scores"] = evaluation.evaluate(
-            lambda points: _sdf_and_grad(field, points),
-            truth,
-            sensor_position_world=mapped.path_world[-1],
-            last_frame=mapped.last_frame,
-        )
+        for name, score in (("scores", evaluation.evaluate), ("bands", evaluation.evaluate_bands)):
+            metrics[name] = score(
+                lambda points: _sdf_and_grad(field, points),
+                truth,
+                sensor_position_world=mapped.path_world[-1],
+                last_frame=mapped.last_frame,
+            )
     elif held_out:
         metrics["held_out"] = _score_held_out(field, mapped.held_out_world)
     print(_summary(metrics))
@@ -202,8 +202,7 @@ def map_frames(
             tqdm.write(str(error), file=sys.stderr)
             continue
         if i in held_out:
-            quota = max(_HELD_OUT_POINTS // len(held_out), 1)
-            kept_world.append(_draw_returns(cloud, pose, config, quota, kept_rng))
+            kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
             continue
         start = time.perf_counter()
         state = jax.block_until_ready(mapping.update(state, cloud, pose))
@@ -237,6 +236,44 @@ def map_frames(
         points_used=points_used,
         points_outside=points_outside,
     )
+
+
+def held_out_frames(count: int) -> range:
+    """Chooses the frames that a map is scored on and not given.
+
+    Args:
+        count: Of the stream's frames.
+
+    Returns:
+        Their indices: every tenth, from the 16th on.
+    """
+    return range(count)[_FIRST_HELD_OUT::_HOLD_OUT_EVERY]
+
+
+def draw_returns(
+    cloud: np.ndarray,
+    pose: np.ndarray,
+    config: Config,
+    frames: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Draws some of a held-out frame's returns that are in range.
+
+    Args:
+        cloud: (N, 3) m, sensor frame.
+        pose: (4, 4) T_world_sensor.
+        config: Of the map, which says what is in range.
+        frames: How many frames are held out in all.
+        rng: Source of randomness.
+
+    Returns:
+        (n, 3) m, world; 20,000 over all frames.
+    """
+    ranges = np.linalg.norm(cloud, axis=-1)  # NaN, which compares as False, for no return
+    cloud = cloud[(ranges >= config.min_range) & (ranges <= config.max_range)]
+    quota = max(_HELD_OUT_POINTS // frames, 1)
+    cloud = rng.choice(cloud, min(quota, len(cloud)), replace=False)
+    return cloud @ pose[:3, :3].T + pose[:3, 3]
 
 
 def slice_heights(sensor: float, low: float, high: float) -> list[float]:
@@ -308,16 +345,6 @@ def _describe(mapped: Mapped, config: Config) -> dict[str, Any]:
     }
 
 
-def _draw_returns(
-    cloud: np.ndarray, pose: np.ndarray, config: Config, quota: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Some of a frame's returns that are in range, (n, 3), world."""
-    ranges = np.linalg.norm(cloud, axis=-1)  # NaN, which compares as False, for no return
-    cloud = cloud[(ranges >= config.min_range) & (ranges <= config.max_range)]
-    cloud = rng.choice(cloud, min(quota, len(cloud)), replace=False)
-    return cloud @ pose[:3, :3].T + pose[:3, 3]
-
-
 def _score_held_out(field: Field, points_world: np.ndarray) -> dict[str, float]:
     """Scores a map on returns that it was not given, where it has seen the place."""
     if not len(points_world):
@@ -352,6 +379,8 @@ def _summary(metrics: dict[str, Any]) -> str:
     scores = metrics.get("scores") or metrics.get("held_out")
     if scores:
         lines += ["", evaluation.format_table(scores), ""]
+    if "bands" in metrics:
+        lines += [evaluation.format_bands(metrics["bands"]), ""]
     return "\n".join(lines)
 
 

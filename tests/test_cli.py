@@ -139,12 +139,35 @@ def test_map_with_ground_truth(tmp_path, capsys):
     scores = metrics["scores"]
     assert scores["visible_cm"] < 6
     assert scores["within_3m_cm"] == pytest.approx(scores["visible_cm"])  # the room is that small
+    assert set(metrics["bands"]) == {"0-5 cm", "5-20 cm", "20-50 cm", ">50 cm"}
+    assert set(metrics["bands"][">50 cm"]) == {"visible_cm", "within_3m_cm", "eikonal", "cosine"}
     vertices = np.asarray(trimesh.load(output / "mesh.ply").vertices)
     assert np.median(np.abs(wall_sdf(vertices)[0])) < 0.06
     text = capsys.readouterr()
     assert "error, visible region" in text.out
     assert f"{scores['visible_cm']:.2f}" in text.out
     assert "mapping: 100%" in text.err
+
+
+def test_map_against_a_mesh(tmp_path, monkeypatch):
+    """It is scored by, and drawn beside, a mesh instead of what the file holds."""
+    pytest.importorskip("igl")
+    stream = write_range(tmp_path / "room.npz", 6)
+    room = trimesh.creation.box(bounds=[LOW, HIGH])
+    room.update_faces(np.arange(12) != 0)  # a hole: it is not watertight
+    room.export(tmp_path / "room.ply")
+    given = {}
+    monkeypatch.setattr(run, "run_stream", lambda *_, **settings: given.update(settings))
+    arguments = ["map", str(stream), "--ground-truth", str(tmp_path / "room.ply"), *BOX]
+    assert cli.main(arguments) == 0
+    truth = given["truth"]
+    assert len(truth.sdf) == 25_000  # not the file's 500
+    # But for few, no ray that met a wall passed nearest to the hole.
+    error = truth.sdf - wall_sdf(truth.points_world)[0]
+    assert (error > -1e-6).all() and (error > 1e-6).mean() < 1e-3
+    assert (given["exact_sdf"](truth.points_world[:1000]) > 0).all()
+    beyond = np.random.default_rng(0).uniform([1.25, -1, 0.1], [1.4, 1, 1.6], (100, 3))
+    assert (given["exact_sdf"](beyond) < 0).all()
 
 
 def test_map_only_the_first_frames(tmp_path, capsys):
@@ -282,6 +305,8 @@ def broken(tmp_path, kind):
         ("good", ["--voxel-size", "0"], "Config.voxel_size is 0.0, expected 0.001 <="),
         ("good", ["--save", "{folder}/none/map.npz"], "{folder}/none: no such folder"),
         ("good", ["--output", "{stream}", *BOX], "{stream}: File exists"),
+        ("good", ["--ground-truth", "{folder}/none", *BOX], "{folder}/none: No such file"),
+        ("good", ["--ground-truth", "{folder}", *BOX], "{folder}/sdf.npy: No such file"),
     ],
 )
 def test_bad_input(tmp_path, capsys, kind, arguments, message):
@@ -344,7 +369,9 @@ def test_demo(tmp_path, capsys):
         "cosine",
         "recall",
         "fpr",
+        "thin_share",
     }
+    assert 0 < metrics["scores"]["thin_share"] < 1
     assert metrics["scores"]["visible_cm"] < 30  # three frames are few
     assert "collisions found" in capsys.readouterr().out
     picture = imread(output / "slices.png")

@@ -297,13 +297,45 @@ def test_bad_arguments_are_named(arguments, match):
 
 def test_ground_truth_has_its_shapes_and_is_exact(clean, truth):
     assert truth.points_world.shape == (5000, 3) and truth.surface_points_world.shape == (5000, 3)
-    assert [field.dtype.name for field in truth] == ["float32"] * 3 + ["int32", "float32"]
+    assert [field.dtype.name for field in truth] == ["float32"] * 3 + [
+        "int32",
+        "float32",
+        "float32",
+    ]
     sdf, grad = signed_distance(clean.model, truth.points_world)
     np.testing.assert_allclose(truth.sdf, sdf, atol=1e-6)
     np.testing.assert_allclose(truth.grad, grad, atol=1e-6)
     assert truth.sdf.min() > -1e-6
     surface, _ = signed_distance(clean.model, truth.surface_points_world)
     assert np.abs(surface).max() < 2e-6  # the rounding of 10 m to float32
+
+
+def test_thin_points_are_seen_and_on_thin_parts(clean, truth):
+    model = clean.model
+    thin = [i for i in range(model.ngeom) if model.geom(i).name.startswith("thin_")]
+    seen = np.zeros(model.ngeom, int)
+    everything = []
+    for index in range(len(clean)):
+        points, geoms = clean.exact_parts(index)
+        np.testing.assert_array_equal(points, clean.exact_surface(index))
+        seen += np.bincount(geoms, minlength=model.ngeom)
+        everything.append(points)
+    expected = sum(min(seen[i], 50) for i in thin if seen[i] >= 10)
+    assert 1000 < expected == len(truth.thin_points_world)
+    exact = {*map(bytes, np.concatenate(everything).astype(np.float32))}
+    assert all(bytes(point) in exact for point in truth.thin_points_world)
+    # The nearest geom to where a ray ended is the one that it met, unless another touches it there.
+    distance = np.stack([_distance_to(model, i, truth.thin_points_world) for i in thin])
+    assert np.abs(distance).min(axis=0).max() < 1e-5
+
+
+def _distance_to(model, geom, points):
+    from hiosdf_jax.demo import primitives
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    local = (points - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
+    return primitives._PRIMITIVES[int(model.geom_type[geom])][0](local, model.geom_size[geom])
 
 
 def test_ground_truth_was_seen_free_in_its_frame(clean, truth):

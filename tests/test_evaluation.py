@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from hiosdf_jax import evaluation
-from hiosdf_jax.evaluation import GroundTruth, evaluate, format_table, held_out_surface
+from hiosdf_jax.evaluation import (
+    GroundTruth,
+    choose_thin,
+    evaluate,
+    evaluate_bands,
+    format_bands,
+    format_table,
+    held_out_surface,
+)
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 CENTER = np.array([0.3, -0.2, 0.1])
@@ -39,7 +47,8 @@ def sphere_truth(count=500, seed=0):
 
 def test_an_exact_map_scores_perfectly():
     scores = evaluate(sphere, sphere_truth(), sensor_position_world=CENTER)
-    for key in ("visible_cm", "near_cm", "within_3m_cm", "bias_cm", "surface_cm"):
+    keys = ("visible_cm", "near_cm", "within_3m_cm", "bias_cm", "near_bias_cm", "surface_cm")
+    for key in keys:
         assert scores[key] == pytest.approx(0, abs=2e-5), key
     assert scores["eikonal"] == pytest.approx(0, abs=1e-6)
     assert scores["cosine"] == pytest.approx(0, abs=1e-6)
@@ -84,7 +93,8 @@ def test_scores_equal_a_loop_over_scalars(last_frame):
 
     # The rule of peers.json: one radius for each point of the file, whatever is then left out.
     radii = np.random.default_rng(1).uniform(0.05, 0.4, len(truth.sdf))
-    error, near, local, signed, eikonal, cosine = [], [], [], [], [], []
+    error, near, near_signed, local, signed, eikonal, cosine = [], [], [], [], [], [], []
+    bands = {"0-5 cm": [], "5-20 cm": [], "20-50 cm": [], ">50 cm": []}
     true, called_true, false, called_false = 0, 0, 0, 0
     for point, d, g, frame, radius in zip(*truth[:4], radii, strict=True):
         if last_frame is not None and frame > last_frame:
@@ -94,10 +104,16 @@ def test_scores_equal_a_loop_over_scalars(last_frame):
         error.append(abs(map_d - d))
         if d < 0.5:
             near.append(abs(map_d - d))
+            near_signed.append(map_d - d)
         if math.dist(point, sensor) < 3:
             local.append(abs(map_d - d))
         eikonal.append(abs(math.hypot(*map_g) - 1))
         cosine.append(1 - sum(a * b for a, b in zip(map_g, g, strict=True)) / math.hypot(*map_g))
+        band = ">50 cm"
+        for end, name in ((0.5, "20-50 cm"), (0.2, "5-20 cm"), (0.05, "0-5 cm")):
+            band = name if d < end else band
+        is_local = math.dist(point, sensor) < 3
+        bands[band].append((error[-1], eikonal[-1], cosine[-1], error[-1] if is_local else None))
         if d < radius:
             true += 1
             called_true += map_d < radius
@@ -110,6 +126,7 @@ def test_scores_equal_a_loop_over_scalars(last_frame):
         "near_cm": 100 * np.mean(near),
         "within_3m_cm": 100 * np.mean(local),
         "bias_cm": 100 * np.mean(signed),
+        "near_bias_cm": 100 * np.mean(near_signed),
         "eikonal": np.mean(eikonal),
         "cosine": np.mean(cosine),
         "recall": called_true / true,
@@ -118,11 +135,52 @@ def test_scores_equal_a_loop_over_scalars(last_frame):
     for key, value in expected.items():
         assert scores[key] == pytest.approx(value, rel=1e-4), key
 
+    by_band = evaluate_bands(noisy, truth, sensor_position_world=sensor, last_frame=last_frame)
+    assert list(by_band) == list(bands)
+    for band, rows in bands.items():
+        columns = list(zip(*rows, strict=True))
+        assert len(rows) > 5
+        expected = {
+            "visible_cm": 100 * np.mean(columns[0]),
+            "eikonal": np.mean(columns[1]),
+            "cosine": np.mean(columns[2]),
+            "within_3m_cm": 100 * np.mean([each for each in columns[3] if each is not None]),
+        }
+        assert by_band[band] == pytest.approx(expected, rel=1e-4), band
+
 
 def test_surface_has_no_score_while_frames_are_left_out():
     truth = sphere_truth()
     assert math.isnan(evaluate(sphere, truth, last_frame=3)["surface_cm"])
     assert math.isfinite(evaluate(sphere, truth, last_frame=9)["surface_cm"])
+
+
+def test_thin_parts_are_kept_within_2_cm():
+    truth = sphere_truth()
+    assert "thin_share" not in evaluate(sphere, truth)
+    shift = np.array([-0.03, -0.019, 0, 0.019, 0.021], np.float32)
+    direction = np.tile([[0, 0, 1]], (5, 1))
+    thin = (CENTER + direction * (RADIUS + shift[:, None])).astype(np.float32)
+    truth = truth._replace(thin_points_world=thin)
+    assert evaluate(sphere, truth)["thin_share"] == pytest.approx(3 / 5)
+    assert "thin_share" not in evaluate(sphere, truth, last_frame=4)  # they carry no frame
+    assert math.isnan(evaluate(lambda p: (p[:, 0] * np.nan, p), truth)["thin_share"])
+
+
+def test_a_thin_part_counts_from_ten_returns_on():
+    part = np.repeat([7, -1, 3, 5, 7], [30, 400, 9, 10, 40])
+    chosen = choose_thin(part, np.random.default_rng(0))
+    assert len(set(chosen)) == len(chosen)
+    assert {*part[chosen]} == {5, 7}
+    assert np.bincount(part[chosen])[[5, 7]].tolist() == [10, 50]
+    assert len(choose_thin(np.full(50, -1), np.random.default_rng(0))) == 0
+
+
+def test_table_of_bands():
+    lines = format_bands(evaluate_bands(sphere, sphere_truth())).splitlines()
+    assert lines[0].split() == ["true", "distance", "visible_cm", "eikonal", "cosine"]
+    assert lines[2].split() == ["0-5", "cm", "0.00", "0.000", "0.000"]
+    assert len(lines) == 6
 
 
 @pytest.mark.parametrize("count", [1, evaluation._CHUNK, evaluation._CHUNK + 1])

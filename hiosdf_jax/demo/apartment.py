@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from hiosdf_jax.demo.primitives import signed_distance
-from hiosdf_jax.evaluation import GroundTruth
+from hiosdf_jax.evaluation import GroundTruth, choose_thin
 
 # The rooms span (0, 0, 0) to (10, 8, 2.6) m and the walls are 0.15 m thick.
 BOUNDS_WORLD = ((-0.2, -0.2, -0.2), (10.2, 8.2, 2.8))  # m
@@ -205,12 +205,16 @@ class ApartmentStream:
         Raises:
           IndexError: the index is out of range.
         """
+        return self._cast(index)[0]
+
+    def _cast(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Depths (height * width,), and the geoms that the rays met."""
         if not 0 <= index < len(self):
             raise IndexError(f"index = {index}, expected 0 <= index < {len(self)}")
         pose = self.poses_world_sensor[index]
         directions = (self._rays / self._lengths[:, None]) @ pose[:3, :3].T
         count = len(directions)
-        ranges = np.empty(count)
+        ranges, geoms = np.empty(count), np.empty(count, np.int32)
         mujoco.mj_multiRay(
             m=self.model,
             d=self._data,
@@ -219,13 +223,13 @@ class ApartmentStream:
             geomgroup=None,  # every group
             flg_static=True,  # static geoms, which all of these are, count
             bodyexclude=-1,
-            geomid=np.empty(count, np.int32),
+            geomid=geoms,
             dist=ranges,
             normal=None,
             nray=count,
             cutoff=mujoco.mjMAXVAL,
         )
-        return ranges / self._lengths
+        return ranges / self._lengths, geoms
 
     def exact_surface(self, index: int) -> np.ndarray:
         """Finds the surface points that a frame sees within the camera's limits of range.
@@ -239,10 +243,26 @@ class ApartmentStream:
         Raises:
           IndexError: the index is out of range.
         """
-        depth = self.exact_depth(index)
+        return self.exact_parts(index)[0]
+
+    def exact_parts(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Finds the surface points that a frame sees, and what they are on.
+
+        Args:
+          index: 0 <= index < len(self).
+
+        Returns:
+          points_world: (n, 3) float64, metres, those of `exact_surface`.
+          geom: (n,) int32, which geom of the model each point is on.
+
+        Raises:
+          IndexError: the index is out of range.
+        """
+        depth, geom = self._cast(index)
         seen = self._in_range(depth)
         pose = self.poses_world_sensor[index]
-        return depth[seen, None] * self._rays[seen] @ pose[:3, :3].T + pose[:3, 3]
+        points = depth[seen, None] * self._rays[seen] @ pose[:3, :3].T + pose[:3, 3]
+        return points, geom[seen]
 
     def _in_range(self, depth: np.ndarray) -> np.ndarray:
         ranges = depth * self._lengths
@@ -261,16 +281,20 @@ def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> 
       seed: of the draws.
 
     Returns:
-      The exact distances; frame is the one that the point was drawn from.
+      The exact distances; frame is the one that the point was drawn from. Thin points are up to
+      50 of each thin part that at least 10 rays met.
 
     Raises:
       ValueError: a frame that was drawn sees no surface.
     """
     rng = np.random.default_rng(seed)
     quotas = rng.multinomial(count, np.full(len(stream), 1 / len(stream)), size=2).T
-    free, surface, frames = [], [], []
+    is_thin = np.array(
+        [stream.model.geom(i).name.startswith("thin_") for i in range(stream.model.ngeom)]
+    )
+    free, surface, frames, thin, part = [], [], [], [], []
     for index, (free_quota, surface_quota) in enumerate(quotas):
-        seen = stream.exact_surface(index)
+        seen, geom = stream.exact_parts(index)
         if not len(seen):
             raise ValueError(f"frame {index} sees no surface within {stream.max_range} m")
         origin = stream.poses_world_sensor[index, :3, 3]
@@ -278,15 +302,19 @@ def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> 
         free.append(origin + along * (rng.choice(seen, free_quota) - origin))
         surface.append(rng.choice(seen, surface_quota))
         frames.append(np.full(free_quota, index, np.int32))
+        thin.append(seen[is_thin[geom]])
+        part.append(geom[is_thin[geom]])
     # Rounded before the distance is taken, so that it is exact at the very points handed out.
     points = np.concatenate(free).astype(np.float32)
     sdf, grad = signed_distance(stream.model, points)
+    chosen = choose_thin(np.concatenate(part), rng)
     return GroundTruth(
         points_world=points,
         sdf=sdf.astype(np.float32),
         grad=grad.astype(np.float32),
         frame=np.concatenate(frames),
         surface_points_world=np.concatenate(surface).astype(np.float32),
+        thin_points_world=np.concatenate(thin)[chosen].astype(np.float32),
     )
 
 
