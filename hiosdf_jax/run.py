@@ -151,7 +151,7 @@ def run_stream(
     _write_mesh(output, surface, up_world)
     _draw_slices(output / "slices.png", field, exact_sdf, mapped.path_world, surface, up_world)
     metrics["total_s"] = time.perf_counter() - start
-    (output / "metrics.json").write_text(json.dumps(_plain(metrics), indent=2) + "\n", "utf-8")
+    (output / "metrics.json").write_text(json.dumps(to_json(metrics), indent=2) + "\n", "utf-8")
     print(f"wrote {output}{os.sep} in {metrics['total_s']:.0f} s")
     if mapped.stopped is not None:
         raise mapped.stopped
@@ -274,6 +274,22 @@ def draw_returns(
     quota = max(_HELD_OUT_POINTS // frames, 1)
     cloud = rng.choice(cloud, min(quota, len(cloud)), replace=False)
     return cloud @ pose[:3, :3].T + pose[:3, 3]
+
+
+def to_json(value: Any) -> Any:
+    """Replaces what JSON cannot hold.
+
+    Args:
+        value: Of dicts, lists, tuples and scalars.
+
+    Returns:
+        The same with lists for tuples, and None for numbers that are not finite.
+    """
+    if isinstance(value, dict):
+        return {key: to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def slice_heights(sensor: float, low: float, high: float) -> list[float]:
@@ -443,15 +459,6 @@ def _write_mesh(output: Path, surface: trimesh.Trimesh, up_world: np.ndarray) ->
         return
     surface.export(model)
     view.save_shaded(picture, surface, up_world=up_world.tolist())
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: it has neither NaN nor tuples."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 # The map is an argument, so that these compile once for maps of one configuration.

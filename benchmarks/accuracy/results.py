@@ -1,0 +1,98 @@
+"""The figures of all runs: gathered over seeds, and laid out as a table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hiosdf_jax.evaluation import METRICS, format_score, lay_out
+
+_PEERS = Path(__file__).with_name("peers.json")
+
+Figures = dict[str, list[float]]  # {metric, or "metric band": one value a seed}
+
+
+def figures_of(records: Sequence[dict[str, Any]]) -> dict[str, Figures]:
+    """Gathers the figures of runs that differ in their seeds alone.
+
+    Args:
+        records: From `measure`.
+
+    Returns:
+        {variant: figures}, for all figures that were measured.
+    """
+    gathered: dict[str, Figures] = {}
+    for record in records:
+        for variant, measured in record["variants"].items():
+            figures = gathered.setdefault(variant, {})
+            flat = dict(measured["scores"])
+            for band, scores in measured["bands"].items():
+                flat |= {f"{metric} {band}": value for metric, value in scores.items()}
+            for name, value in flat.items():
+                figures.setdefault(name, []).append(np.nan if value is None else value)
+    return gathered
+
+
+def meaning(figure: str) -> str:
+    """The metric of a figure.
+
+    Args:
+        figure: A metric, or a metric and a band.
+
+    Returns:
+        A key of `evaluation.METRICS`.
+    """
+    return figure.split(" ", 1)[0]
+
+
+def load_peers() -> dict[str, dict[str, Figures]]:
+    """Reads what other systems score.
+
+    Returns:
+        {stream: {peer: figures}}.
+    """
+    peers = json.loads(_PEERS.read_text("utf-8"))
+    return {
+        stream: {
+            name: {metric: np.atleast_1d(value).tolist() for metric, value in scores.items()}
+            for name, scores in systems.items()
+        }
+        for stream, systems in peers.items()
+    }
+
+
+def format_tables(rows: Mapping[tuple[str, str, str], Figures]) -> str:
+    """Lays figures out for a terminal: the scores, and below them those by band of true distance.
+
+    Args:
+        rows: {(stream, configuration or peer, variant): figures}.
+
+    Returns:
+        The table. Several seeds are given as their mean and half of their range.
+    """
+    names = [key for key in METRICS if any(key in figures for figures in rows.values())]
+    cells = [["stream", "map", "asked", *names]]
+    for labels, figures in rows.items():
+        cells.append([*labels, *(_cell(name, figures.get(name)) for name in names)])
+    tables = [lay_out(cells, text_columns=3)]
+    banded = dict.fromkeys(name for figures in rows.values() for name in figures if " " in name)
+    bands = list(dict.fromkeys(name.split(" ", 1)[1] for name in banded))
+    if bands:
+        cells = [["stream", "map", "asked", "by true distance", *bands]]
+        for labels, figures in rows.items():
+            for metric in dict.fromkeys(meaning(name) for name in figures if name in banded):
+                values = (figures.get(f"{metric} {band}") for band in bands)
+                cells.append([*labels, metric, *(_cell(metric, value) for value in values)])
+        tables.append(lay_out(cells, text_columns=4))
+    return "\n\n".join(tables)
+
+
+def _cell(name: str, values: list[float] | None) -> str:
+    text = format_score(meaning(name), values)
+    if text == "-" or values is None or len(values) < 2:
+        return text
+    return f"{text}±{format_score(meaning(name), np.ptp(values) / 2)}"
