@@ -136,13 +136,13 @@ def _map(options: argparse.Namespace) -> None:
 def _ground_truth(
     file: Path, stream: Stream, max_range: float
 ) -> tuple[GroundTruth, Callable[[np.ndarray], np.ndarray]]:
-    """Exact distances where the stream has seen, and anywhere."""
+    """Exact distances where the stream has seen, and to draw."""
     from hiosdf_jax import ground_truth
 
     rays = _checked(lambda: ground_truth.read_rays(stream, max_range), code=_NOTHING_MAPPED)
     scene = _checked(lambda: ground_truth.read_scene(file, ground_truth.sensor_path(rays)))
     truth = _checked(lambda: ground_truth.sample_visible(scene, rays))
-    return truth, lambda points_world: scene.sdf_and_grad(points_world)[0]
+    return truth, scene.sdf_to_draw
 
 
 def _configure(name: str, bounds: Any, **overrides: float) -> Config:

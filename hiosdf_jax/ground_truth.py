@@ -66,10 +66,13 @@ class Scene(NamedTuple):
     Attributes:
         sdf_and_grad: Takes (N, 3) m, world, to distances (N,) m, positive in free space, and unit
             gradients (N, 3), all float64; NaN where the scene does not reach.
+        sdf_to_draw: Takes (N, 3) m to distances (N,) m whose zeros are surfaces and nothing else:
+            without a sign where that tells what was seen, since it jumps at the edge of a shadow.
         cast: Takes rays to where they first meet the scene; None for a scene without triangles.
     """
 
     sdf_and_grad: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    sdf_to_draw: Callable[[np.ndarray], np.ndarray]
     cast: Callable[[Rays], Hits] | None
 
 
@@ -192,7 +195,12 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
             thin_part=np.where(hit, part_of_face[np.where(hit, face, 0)], -1),
         )
 
-    return Scene(sdf_and_grad, cast)
+    def sdf_to_draw(points_world: np.ndarray) -> np.ndarray:
+        if is_solid:
+            return sdf_and_grad(points_world)[0]
+        return np.sqrt(tree.squared_distance(vertices, faces, np.array(points_world, float))[0])
+
+    return Scene(sdf_and_grad, sdf_to_draw, cast)
 
 
 def grid_scene(folder: str | os.PathLike[str]) -> Scene:
@@ -259,7 +267,7 @@ def grid_scene(folder: str | os.PathLike[str]) -> Scene:
         length = np.linalg.norm(slope, axis=-1, keepdims=True)
         return sdf_at(points), slope / np.where(length > 0, length, np.nan)
 
-    return Scene(sdf_and_grad, None)
+    return Scene(sdf_and_grad, lambda points: sdf_at(np.asarray(points, float)), None)
 
 
 def read_rays(stream: Stream, max_range: float = np.inf) -> Rays:

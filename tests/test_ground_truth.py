@@ -90,6 +90,7 @@ def test_a_watertight_box_is_signed_by_its_solid(inside_out):
     expected = sign * box_sdf(points, half)
     np.testing.assert_allclose(sdf, expected, atol=1e-12)
     assert {*np.sign(sdf)} == {-1, 1}
+    np.testing.assert_array_equal(mesh_scene(mesh, ORIGIN).sdf_to_draw(points), sdf)
     outside = sign * sdf > 0.01  # inside, the slopes of a box have creases
     numeric = slopes(lambda p: sign * box_sdf(p, half), points[outside])
     np.testing.assert_allclose(grad[outside], numeric, atol=1e-4)
@@ -127,6 +128,7 @@ def test_a_sheet_is_signed_by_what_the_sensor_saw():
         * np.where(shadow | (points[:, 0] > 0), 1, -1)[:, None],
         atol=1e-12,
     )
+    np.testing.assert_allclose(in_front.sdf_to_draw(points), np.abs(sdf), atol=1e-12)
     both = mesh_scene(wall, np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
     assert (both.sdf_and_grad(points)[0] > 0).all()
 
@@ -238,6 +240,7 @@ def test_a_grid_of_samples(tmp_path):
     points = points_in(low + 0.05, high - 0.05)
     for place in (tmp_path, tmp_path / "sdf.npy"):
         sdf, grad = read_scene(place, ORIGIN).sdf_and_grad(points)
+        np.testing.assert_array_equal(read_scene(place, ORIGIN).sdf_to_draw(points), sdf)
         # Trilinear: the error is at most h^2 / 8 times the second derivatives, which sum to 2 / r.
         far = np.linalg.norm(points - [0.1, 0.2, -0.1], axis=-1) > 0.2
         assert far.mean() > 0.9
