@@ -1,0 +1,225 @@
+"""Few spheres that cover a solid entirely and protrude beyond it by at most a tolerance.
+
+A ball around c of radius tolerance - sdf(c) is the largest that protrudes no farther: nothing in it
+is farther from the solid than the tolerance. Capsules and boxes have covers in closed form; for
+other solids such balls are chosen greedily until each cell of a partition of the solid lies in one
+of them, so that the cover is complete by construction and not up to a sampling.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+# Lower and upper bounds of the signed distance, m, to (N, 3) points.
+SignedDistance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+Spheres = tuple[np.ndarray, np.ndarray]
+
+# Half diagonals of the smallest cells of the partition and of the grid of centers, shares of the
+# tolerance: finer cells need fewer spheres and more time.
+_CELL = 1 / 8
+_CENTER = 1 / 2
+# Cells may be larger deep inside, where the balls are large: half diagonal over depth.
+_CELL_BY_DEPTH = 1 / 4
+# Cells and centers that the greedy choice looks at at once; it goes on until all are done.
+_MOST_CELLS = 12_000
+_MOST_CENTERS = 4_000
+_MOST_OWN = 500
+
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
+class _Ball(NamedTuple):
+    """A ball, the cells in it, and the radius that contains each of them."""
+
+    center: np.ndarray
+    radius: float
+    cells: np.ndarray
+    needed: np.ndarray
+
+
+def cover_capsule(radius: float, half_length: float, tolerance: float) -> Spheres:
+    """Covers a capsule by equal spheres in a row.
+
+    Args:
+        radius: m.
+        half_length: Of its axis, along z, m; 0 makes a sphere.
+        tolerance: m, > 0.
+
+    Returns:
+        Centers (S, 3) and radii (S,), m, float64.
+    """
+    # With gaps of 2 g and the outer centers e from the ends of the axis, a sphere must reach
+    # radius + e at the ends and hypot(radius, g) between; m gaps make both the same if
+    # (m^2 - 1) e^2 + 2 (m^2 radius + half_length) e - half_length^2 = 0.
+    gaps = 0
+    inset = half_length
+    while inset > tolerance:
+        gaps += 1
+        linear = 2 * (gaps**2 * radius + half_length)
+        root = np.sqrt(linear**2 + 4 * (gaps**2 - 1) * half_length**2)
+        inset = 2 * half_length**2 / (linear + root)
+    centers = np.zeros((gaps + 1, 3))
+    centers[:, 2] = np.linspace(inset - half_length, half_length - inset, gaps + 1)
+    return centers, np.full(gaps + 1, radius + inset)
+
+
+def cover_box(half: np.ndarray, tolerance: float) -> Spheres:
+    """Covers a box by the spheres around the cells of a lattice, larger ones inside.
+
+    Args:
+        half: (3,) half of its edges, m.
+        tolerance: m, > 0.
+
+    Returns:
+        Centers (S, 3) and radii (S,), m, float64.
+    """
+    # The lattices that are worth trying, coarse to fine: edges that divide one of the box's.
+    finest = tolerance / 2
+    sizes = np.unique(np.concatenate([h / np.arange(1, np.ceil(h / finest) + 2) for h in half]))
+    for size in sizes[::-1]:
+        counts = np.maximum(np.ceil(half / size - 1e-9).astype(int), 1)
+        cell = half / counts  # half of a cell's edges
+        radius = float(np.linalg.norm(cell))
+        if radius - cell.min() <= tolerance:
+            break
+    else:
+        raise AssertionError("cells of half the tolerance protrude less than the tolerance")
+    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(-1, 3)
+    hollow = counts.min() >= 3
+    if hollow:
+        index = index[np.any((index == 0) | (index == counts - 1), axis=1)]
+    centers, radii = (2 * index + 1 - counts) * cell, np.full(len(index), radius)
+    if not hollow:
+        return centers, radii
+    # The cells inside are a box of their own, whose spheres may fill the layer around it too.
+    inner_centers, inner_radii = cover_box(half - 2 * cell, tolerance + 2 * cell.min())
+    return np.concatenate([centers, inner_centers]), np.concatenate([radii, inner_radii])
+
+
+def cover_solid(
+    distance: SignedDistance, low: np.ndarray, high: np.ndarray, tolerance: float
+) -> Spheres:
+    """Covers any solid whose signed distance is known.
+
+    Args:
+        distance: Bounds of its signed distance.
+        low: (3,) least corner of a box that contains it, m.
+        high: (3,) greatest corner.
+        tolerance: m, > 0.
+
+    Returns:
+        Centers (S, 3) and radii (S,), m, float64.
+    """
+    # Imported here: what needs no cover of this kind does without.
+    from scipy.spatial import KDTree
+
+    random = np.random.default_rng(0)
+    cells, reach = _partition(distance, low, high, _CELL * tolerance)
+    tree = KDTree(cells)
+    centers, size = _partition(distance, low, high, _CENTER * tolerance)
+    # With their corners, so that planes of symmetry have centers on them.
+    corners = (centers[:, None] + _CORNERS * size[:, None, None] / np.sqrt(3)).reshape(-1, 3)
+    centers = np.unique(np.concatenate([centers, corners]).round(9), axis=0)
+    radii = tolerance - distance(centers)[1]
+    centers, radii = centers[radii >= tolerance], radii[radii >= tolerance]
+    balls: list[_Ball] = []
+    uncovered = np.ones(len(cells), bool)
+    while uncovered.any():
+        some = _draw(random, np.nonzero(uncovered)[0], _MOST_CELLS)
+        rows = _draw(random, np.arange(len(centers)), _MOST_CENTERS)
+        # Around a cell itself there is always a ball that contains it.
+        own = cells[_draw(random, some, _MOST_OWN)]
+        tried = np.concatenate([centers[rows], own])
+        largest = np.concatenate([radii[rows], tolerance - distance(own)[1]])
+        picked = _choose(tried, largest, cells[some], reach[some])
+        assert picked, "a ball around the center of a cell contains the cell"
+        for k in picked:
+            near = np.asarray(tree.query_ball_point(tried[k], largest[k]), int)
+            needed = np.linalg.norm(cells[near] - tried[k], axis=1) + reach[near]
+            held = needed <= largest[k]
+            balls.append(_Ball(tried[k], largest[k], near[held], needed[held]))
+            uncovered[near[held]] = False
+    return _tighten(balls, len(cells))
+
+
+def _partition(
+    distance: SignedDistance, low: np.ndarray, high: np.ndarray, finest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cubes that contain a solid: centers (N, 3) and half diagonals (N,), at most `finest`."""
+    edge = 2 * finest / np.sqrt(3)
+    edge *= 2.0 ** max(0, np.floor(np.log2((high - low).min() / edge + 1e-12)))
+    counts = np.maximum(np.ceil((high - low) / edge), 1)
+    axes = [(np.arange(n) - (n - 1) / 2) * edge for n in counts]
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + (low + high) / 2
+    parts = []
+    while len(centers):
+        reach = edge * np.sqrt(3) / 2
+        least, greatest = distance(centers)
+        touching = least <= reach
+        centers, depth = centers[touching], -greatest[touching]
+        done = (reach <= finest * (1 + 1e-9)) | (reach <= _CELL_BY_DEPTH * depth)
+        parts.append((centers[done], np.full(done.sum(), reach)))
+        centers = (centers[~done][:, None] + _CORNERS * edge / 4).reshape(-1, 3)
+        edge /= 2
+    return np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts])
+
+
+def _draw(random: np.random.Generator, index: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the indices, in their order."""
+    return index if len(index) <= most else np.sort(random.choice(index, most, replace=False))
+
+
+def _choose(
+    centers: np.ndarray, radii: np.ndarray, cells: np.ndarray, reach: np.ndarray
+) -> list[int]:
+    """Chooses balls greedily, those of the cells that only small balls contain first."""
+    from scipy.spatial.distance import cdist
+
+    contains = np.empty((len(centers), len(cells)), bool)
+    for start in range(0, len(centers), 256):
+        part = slice(start, start + 256)
+        contains[part] = cdist(centers[part], cells) + reach <= radii[part, None]
+    largest = np.zeros(len(cells))
+    for row, radius in zip(contains, radii, strict=True):
+        largest[row] = np.maximum(largest[row], radius)
+    uncovered = contains.any(axis=0)
+    picked = []
+    for cell in np.argsort(largest, kind="stable"):
+        if uncovered[cell]:
+            able = np.nonzero(contains[:, cell])[0]
+            best = able[(contains[able] & uncovered).sum(axis=1).argmax()]
+            picked.append(int(best))
+            uncovered &= ~contains[best]
+    return picked
+
+
+def _tighten(balls: list[_Ball], cells: int) -> Spheres:
+    """Leaves out balls that the others make needless, and shrinks those that stay."""
+    times = np.zeros(cells, int)
+    for ball in balls:
+        times[ball.cells] += 1
+    kept = []
+    for ball in sorted(balls, key=lambda ball: ball.radius):
+        if (times[ball.cells] > 1).all():
+            times[ball.cells] -= 1
+        else:
+            kept.append(ball)
+    # Each cell goes to the ball that has most room for it.
+    room, needed = np.full(cells, -np.inf), np.zeros(cells)
+    owner = np.zeros(cells, int)
+    for k, ball in enumerate(kept):
+        better = ball.radius - ball.needed > room[ball.cells]
+        won = ball.cells[better]
+        room[won], owner[won], needed[won] = (
+            (ball.radius - ball.needed)[better],
+            k,
+            ball.needed[better],
+        )
+    smallest = np.zeros(len(kept))
+    np.maximum.at(smallest, owner, needed)
+    centers = np.stack([ball.center for ball in kept])
+    return centers[smallest > 0], smallest[smallest > 0]

@@ -1,0 +1,367 @@
+"""A model's geoms as spheres: complete, protruding little; placed as MuJoCo places the geoms."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mujoco import mjx
+
+from hiosdf_jax import planning
+from hiosdf_jax.demo import signed_distance
+from hiosdf_jax.planning import cover, solids
+from hiosdf_jax.state import Baked
+
+TOLERANCE = 0.03
+EGG = np.array([0.1, 0.06, 0.04])
+
+ARM = """
+<mujoco>
+  <default><geom contype="1" conaffinity="0"/></default>
+  <asset>
+    <mesh name="wedge" vertex="0 0 0  .2 0 0  0 .15 0  .2 .15 0  0 0 .1  0 .15 .1"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 .1"/>
+    <body name="base" pos=".1 -.2 .3" euler="0 0 40">
+      <geom name="stand" type="cylinder" size=".08 .15" pos="0 0 -.15"/>
+      <body name="upper" pos="0 0 .05">
+        <joint name="turn" axis="0 0 1"/>
+        <joint name="lift" axis="0 1 0"/>
+        <geom name="bone" type="capsule" fromto="0 0 0 .3 0 .1" size=".04"/>
+        <geom name="look" type="box" size="1 1 1" contype="0" conaffinity="0"/>
+        <body name="lower" pos=".3 0 .1">
+          <joint name="bend" axis="0 1 0" pos="0 0 .01"/>
+          <geom name="beam" type="box" size=".15 .03 .05" pos=".15 0 0" euler="20 0 0"/>
+          <geom name="egg" type="ellipsoid" size=".1 .06 .04" pos=".3 0 0" euler="0 30 10"/>
+          <body name="hand" pos=".35 0 0">
+            <joint name="twist" axis="1 0 0"/>
+            <geom name="ball" type="sphere" size=".06"/>
+            <geom name="finger" type="mesh" mesh="wedge" pos=".1 0 0" euler="0 0 25"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(ARM)
+
+
+@pytest.fixture(scope="module")
+def alone(model):
+    return {name: planning.spheres_from_model(model, TOLERANCE, geoms=[name]) for name in GEOMS}
+
+
+@pytest.fixture(scope="module")
+def spheres(model):
+    return planning.spheres_from_model(model, TOLERANCE)
+
+
+def exact_distance(name, geom_xml):
+    """Signed distance to a geom in its own frame, by code that the covers do not use."""
+    if geom_xml is not None:
+        alone = mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody>{geom_xml}</worldbody></mujoco>"
+        )
+        return lambda points: signed_distance(alone, points)[0]
+    if name == "egg":
+        solid = trimesh.creation.icosphere(3)
+        solid.apply_scale(EGG)
+    else:
+        compiled = mujoco.MjModel.from_xml_string(ARM)
+        solid = trimesh.Trimesh(compiled.mesh_vert, compiled.mesh_face, process=False)
+    return lambda points: distance_to_convex(solid, points)
+
+
+def distance_to_convex(solid, points):
+    """Signed distance by all planes and, outside, the closest points of all triangles."""
+    heights = points @ solid.face_normals.T - np.sum(
+        solid.face_normals * solid.triangles[:, 0], axis=1
+    )
+    value = heights.max(axis=1)
+    outside = value > 0
+    least = np.full(outside.sum(), np.inf)
+    for triangle in solid.triangles:
+        repeated = np.broadcast_to(triangle, (len(least), 3, 3))
+        closest = trimesh.triangles.closest_point(repeated, points[outside])
+        least = np.minimum(least, np.linalg.norm(points[outside] - closest, axis=1))
+    value[outside] = least
+    return value
+
+
+GEOMS = {  # as in ARM, at the origin; at most so many spheres
+    "stand": ("<geom type='cylinder' size='.08 .15'/>", 25),
+    "bone": (f"<geom type='capsule' size='.04 {np.hypot(0.3, 0.1) / 2}'/>", 4),
+    "beam": ("<geom type='box' size='.15 .03 .05'/>", 12),
+    "egg": (None, 10),
+    "ball": ("<geom type='sphere' size='.06'/>", 1),
+    "finger": (None, 45),
+}
+
+
+@pytest.mark.parametrize("name", GEOMS)
+def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, name):
+    geom, spheres = model.geom(name), alone[name]
+    xml, most = GEOMS[name]
+    distance = exact_distance(name, xml)
+    # Back in the geom's own frame, by MuJoCo's arithmetic.
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, geom.quat)
+    centers = (np.asarray(spheres.centers_body, float) - geom.pos) @ rotation.reshape(3, 3)
+    radii = np.asarray(spheres.radii, float)
+    assert (spheres.body == geom.bodyid[0]).all()
+    assert len(radii) <= most
+
+    # Dense points in the solid, and on it: those, moved out to its surface by bisection.
+    rng = np.random.default_rng(0)
+    box = model.geom_aabb[geom.id]
+    low, high = box[:3] - box[3:], box[:3] + box[3:]
+    points = rng.uniform(low, high, (10_000, 3))
+
+    def is_in(points):
+        return np.sum((points / EGG) ** 2, axis=1) <= 1 if name == "egg" else distance(points) <= 0
+
+    inside, outside = points[is_in(points)], points[~is_in(points)]
+    assert len(inside) > 2000
+    outside = rng.permutation(outside)[: len(inside)]
+    near, far = inside[: len(outside)].copy(), outside[: len(inside)].copy()
+    for _ in range(12):
+        middle = (near + far) / 2
+        solid = is_in(middle)[:, None]
+        near, far = np.where(solid, middle, near), np.where(solid, far, middle)
+    corners = low + (high - low) * np.array(list(np.ndindex(2, 2, 2)))
+    corners = corners[is_in(corners * (1 - 1e-9))]
+    covered = np.concatenate([inside, near, corners])
+    room = np.linalg.norm(covered[:, None] - centers, axis=2) - radii
+    assert room.min(axis=1).max() <= 1e-6
+
+    # Dense points on the spheres are hardly farther from the solid than the tolerance.
+    directions = trimesh.creation.icosphere(3).vertices
+    outline = (centers[:, None] + radii[:, None, None] * directions).reshape(-1, 3)
+    farthest = distance(outline[:: max(1, len(outline) // 2000)]).max()
+    assert farthest <= TOLERANCE + (4e-4 if name == "egg" else 1e-6)  # an inscribed polyhedron
+    assert farthest > 0.4 * TOLERANCE or name == "ball"
+
+
+def test_bodies_and_geoms_are_chosen_by_name_or_id(model, alone, spheres):
+    # All colliding geoms but the world's, in their order: neither the floor nor "look".
+    together = jax.tree.map(lambda *parts: np.concatenate(parts), *alone.values())
+    jax.tree.map(np.testing.assert_array_equal, spheres, together)
+    assert [leaf.dtype for leaf in jax.tree.leaves(spheres)] == [
+        jnp.int32,
+        jnp.float32,
+        jnp.float32,
+    ]
+    hand = model.body("hand").id
+    for bodies in (["hand"], [hand], np.array([hand])):
+        chosen = planning.spheres_from_model(model, TOLERANCE, bodies=bodies)
+        assert set(np.asarray(chosen.body).tolist()) == {hand}
+        assert len(chosen.radii) == len(alone["ball"].radii) + len(alone["finger"].radii)
+    by_id = planning.spheres_from_model(model, TOLERANCE, geoms=[model.geom("bone").id])
+    jax.tree.map(np.testing.assert_array_equal, by_id, alone["bone"])
+
+
+def test_a_model_of_mjx_gives_the_same_spheres(model, alone):
+    found = planning.spheres_from_model(mjx.put_model(model), TOLERANCE, bodies=["upper", "hand"])
+    expected = jax.tree.map(
+        lambda *parts: np.concatenate(parts), *(alone[name] for name in ("bone", "ball", "finger"))
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), found, expected)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"geoms": ["floor"]}, r"geom 0 \('floor'\) is of type plane"),
+        ({"bodies": ["world"]}, r"geom 0 \('floor'\) is of type plane"),
+        ({"geoms": ["nose"]}, "no geom 'nose'"),
+        ({"bodies": ["leg"]}, "no body 'leg', expected one of .*'upper'"),
+        ({"bodies": [17]}, "no body 17, expected 0 to 4"),
+        ({"bodies": "hand"}, "string 'hand'"),
+        ({"bodies": []}, "no geom is chosen"),
+        ({"bodies": ["hand"], "geoms": ["ball"]}, "both"),
+        ({"tolerance_m": 0.0}, "tolerance_m is 0.0"),
+        ({"tolerance_m": float("nan")}, "tolerance_m is nan"),
+    ],
+)
+def test_bad_choices_are_named(model, arguments, words):
+    with pytest.raises(ValueError, match=words):
+        planning.spheres_from_model(model, **({"tolerance_m": TOLERANCE} | arguments))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.005, 0.3), st.floats(0, 1), st.floats(0.003, 0.1))
+def test_rows_of_spheres_cover_any_capsule(radius, half_length, tolerance):
+    centers, radii = cover.cover_capsule(radius, half_length, tolerance)
+    # On the axis, so that a sphere protrudes as much as it is larger than the capsule.
+    assert (centers[:, :2] == 0).all()
+    assert (np.abs(centers[:, 2]) <= half_length).all()
+    assert (radii <= radius + tolerance + 1e-12).all()
+    # The outline: sides and a cap, by the angle from the axis.
+    angle = np.linspace(0, np.pi / 2, 200)
+    z = np.concatenate([np.linspace(0, half_length, 2000), half_length + radius * np.cos(angle)])
+    out = np.concatenate([np.full(2000, radius), radius * np.sin(angle)])
+    room = np.hypot(out[:, None], z[:, None] - centers[:, 2]) - radii
+    assert room.min(axis=1).max() <= 1e-9
+    # One sphere fewer could not do, at the largest radius allowed.
+    if len(radii) > 1:
+        reach = np.sqrt((radius + tolerance) ** 2 - radius**2)
+        assert 2 * (half_length - tolerance) > (len(radii) - 2) * 2 * reach - 1e-9
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(0.01, 0.3), min_size=3, max_size=3), st.floats(0.015, 0.1))
+def test_lattices_of_spheres_cover_any_box(half, tolerance):
+    half = np.array(half)
+    centers, radii = cover.cover_box(half, tolerance)
+    assert (np.abs(centers) <= half).all()
+    assert (radii - (half - np.abs(centers)).min(axis=1)).max() <= tolerance + 1e-9
+    rng = np.random.default_rng(0)
+    inside = rng.uniform(-half, half, (1500, 3))
+    faces = inside[:750].copy()
+    axis = rng.integers(3, size=750)
+    faces[np.arange(750), axis] = half[axis] * rng.choice([-1, 1], 750)
+    corners = half * np.array(list(np.ndindex(2, 2, 2))) * 2 - half
+    points = np.concatenate([inside, faces, corners])
+    room = np.linalg.norm(points[:, None] - centers, axis=2) - radii
+    assert room.min(axis=1).max() <= 1e-9
+
+
+def test_the_distance_to_an_ellipsoid_is_that_to_a_fine_mesh_of_it():
+    solid = trimesh.creation.icosphere(4)
+    solid.apply_scale(EGG)
+    rng = np.random.default_rng(1)
+    points = np.concatenate(
+        [rng.uniform(-0.12, 0.12, (100, 3)), np.zeros((1, 3)), np.diag(EGG) / 2]
+    )
+    least, greatest = solids.ellipsoid(EGG)(points)
+    np.testing.assert_array_equal(least, greatest)
+    np.testing.assert_allclose(least, distance_to_convex(solid, points), atol=3e-4)
+
+
+def test_the_bounds_of_the_distance_to_a_mesh_hold():
+    compiled = mujoco.MjModel.from_xml_string(ARM)
+    vertices, faces = compiled.mesh_vert.astype(float), compiled.mesh_face
+    points = np.random.default_rng(2).uniform(-0.2, 0.2, (3000, 3))
+    exact = distance_to_convex(trimesh.Trimesh(vertices, faces, process=False), points)
+    least, greatest = solids.mesh(vertices, faces, TOLERANCE)(points)
+    assert (least <= exact + 1e-9).all()
+    assert (exact <= greatest + 1e-9).all()
+    assert (greatest - least).max() < 0.5 * TOLERANCE
+    # Without one face it encloses nothing: a sheet, no point of which is inside.
+    _, greatest = solids.mesh(vertices, faces[1:], TOLERANCE)(points)
+    assert (greatest >= 0).all()
+
+
+def slanted(normal, offset):
+    """A field that is linear, so that interpolation is exact, over a box of 6 m."""
+    axis = np.linspace(-3, 3, 13)
+    values = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1) @ normal + offset
+    values = jnp.asarray(values, jnp.float32)
+    return Baked(
+        corner_world=jnp.full(3, -3.0),
+        resolution=jnp.float32(0.5),
+        sdf=values,
+        frontier=jnp.full_like(values, 10.0),
+        lower=values,
+        updates=jnp.int32(1),
+        stamp=jnp.float32(0),
+    )
+
+
+NORMAL, OFFSET = np.array([0.48, -0.6, 0.64]), 0.5
+CONFIGURATIONS = np.random.default_rng(3).uniform(-1.2, 1.2, (6, 4)).astype(np.float32)
+
+
+def mujoco_centers(model, spheres, joints):
+    data = mujoco.MjData(model)
+    data.qpos[:] = joints
+    mujoco.mj_kinematics(model, data)
+    centers = [
+        data.xpos[body] + data.xmat[body].reshape(3, 3) @ center
+        for body, center in zip(spheres.body, np.asarray(spheres.centers_body, float), strict=True)
+    ]
+    return np.array(centers), data
+
+
+def test_spheres_are_placed_where_mujoco_has_the_bodies(model, spheres):
+    for joints in CONFIGURATIONS[:2]:
+        expected, data = mujoco_centers(model, spheres, joints)
+        np.testing.assert_allclose(planning.place_spheres(spheres, data), expected, atol=1e-6)
+    # The world's frame moved by any rigid motion moves them all.
+    poses = planning.BodyPoses(np.stack([data.xpos] * 2), np.stack([data.xmat] * 2))
+    placed = jax.jit(planning.place_spheres)(spheres, poses)
+    np.testing.assert_allclose(placed, np.stack([expected] * 2), atol=1e-6)
+    # The ball's center is where MuJoCo has that geom.
+    ball = np.asarray(spheres.radii) == np.float32(0.06)
+    assert ball.sum() == 1
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.geom("ball").xpos, np.asarray(placed)[0, ball][0], atol=1e-6)
+
+
+def test_a_robots_clearance_and_its_gradient_through_mjx(model, spheres):
+    moving = np.asarray(spheres.body) > model.body("base").id
+    spheres = jax.tree.map(lambda array: array[moving], spheres)
+    simulated = mjx.put_model(model)
+    start = mjx.make_data(simulated)
+
+    def clearance(field, joints):
+        data = mjx.kinematics(simulated, start.replace(qpos=joints))
+        return planning.robot_clearance(field, spheres, data)
+
+    field = slanted(NORMAL, OFFSET)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(clearance, 1), (None, 0)))(
+        field, CONFIGURATIONS
+    )
+
+    def reference(joints):
+        centers, _ = mujoco_centers(model, spheres, joints)
+        return np.min(centers @ NORMAL + OFFSET - np.asarray(spheres.radii, float))
+
+    expected = [reference(joints) for joints in CONFIGURATIONS]
+    np.testing.assert_allclose(values, expected, atol=1e-5)
+    step = 1e-5
+    for axis in range(4):
+        shift = step * np.eye(4)[axis]
+        numeric = [
+            (reference(q + shift) - reference(q - shift)) / (2 * step) for q in CONFIGURATIONS
+        ]
+        np.testing.assert_allclose(slopes[:, axis], numeric, atol=2e-4)
+    assert np.abs(slopes).max() > 0.1
+
+
+def test_bad_poses_are_named(model, spheres):
+    xpos, xmat = np.zeros((5, 3)), np.zeros((5, 3, 3))
+    for poses, words in (
+        (planning.BodyPoses(xpos[:3], xmat[:3]), "3 bodies, expected more than 4"),
+        (planning.BodyPoses(xpos[:, :2], xmat), r"xpos has shape \(5, 2\)"),
+        (planning.BodyPoses(xpos, xmat[:4]), r"xmat has shape \(4, 3, 3\), expected \(5, 3, 3\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            planning.place_spheres(spheres, poses)
+
+
+def test_planning_imports_without_simulator_and_mesh_library():
+    code = """
+import sys
+class Refuse:
+    def find_spec(self, name, *_):
+        if name.split(".")[0] in ("mujoco", "trimesh"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Refuse())
+from hiosdf_jax import planning
+assert "scipy.spatial" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
