@@ -214,6 +214,10 @@ def test_rows_of_spheres_cover_any_capsule(radius, half_length, tolerance):
     out = np.concatenate([np.full(2000, radius), radius * np.sin(angle)])
     room = np.hypot(out[:, None], z[:, None] - centers[:, 2]) - radii
     assert room.min(axis=1).max() <= 1e-9
+    # No larger than needed: the cover touches the outline between two spheres and at the ends.
+    assert room.min(axis=1)[-200:].max() >= -1e-9
+    if len(radii) > 1:
+        assert room.min(axis=1)[:2000].max() >= -1e-3
     # One sphere fewer could not do, at the largest radius allowed.
     if len(radii) > 1:
         reach = np.sqrt((radius + tolerance) ** 2 - radius**2)
@@ -262,6 +266,25 @@ def test_the_bounds_of_the_distance_to_a_mesh_hold():
     # Without one face it encloses nothing: a sheet, no point of which is inside.
     _, greatest = solids.mesh(vertices, faces[1:], TOLERANCE)(points)
     assert (greatest >= 0).all()
+
+
+def test_the_hole_of_a_ring_stays_open():
+    ring = trimesh.creation.torus(0.12, 0.03, major_sections=64, minor_sections=32)
+    vertices, faces = np.asarray(ring.vertices), np.asarray(ring.faces)
+
+    def distance(points):  # of the torus that the mesh is inscribed in, by at most 0.3 mm
+        radial = np.hypot(points[:, 0], points[:, 1]) - 0.12
+        return np.hypot(radial, points[:, 2]) - 0.03
+
+    solid = solids.mesh(vertices, faces, TOLERANCE)
+    centers, radii = cover.cover_solid(solid, *ring.bounds, TOLERANCE)
+    outline = centers[:, None] + radii[:, None, None] * trimesh.creation.icosphere(2).vertices
+    assert distance(outline.reshape(-1, 3)).max() <= TOLERANCE
+    points = np.random.default_rng(4).uniform(*ring.bounds, (30_000, 3))
+    points = np.concatenate([points[distance(points) < -4e-4], vertices])
+    room = np.linalg.norm(points[:, None] - centers, axis=2) - radii
+    assert room.min(axis=1).max() <= 1e-9
+    assert len(radii) <= 20
 
 
 def slanted(normal, offset):

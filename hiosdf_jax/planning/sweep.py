@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+import numbers
 from typing import Any
 
 import jax
@@ -37,8 +38,9 @@ def swept_clearance(
     """Lower bound of the clearance of spheres all along straight lines: nothing is tunnelled.
 
     It is one for every field that is no steeper than `slope` along the line. Exact distances have
-    slope 1; a served map is no steeper than 1.1 but for places where it jumps, most of them
-    changes of sign behind surfaces.
+    slope 1. A served map jumps in a few places, most of them in unseen space, and a baked one has
+    cells there that are steep: with the default, 0.2 % of motions of 0.2 m through a mapped house
+    had a bound that was more than 1 mm too high.
 
     The gradient is that of the segment which has the lowest bound: two evaluations, whatever
     their number.
@@ -66,7 +68,7 @@ def swept_clearance(
             f"end_world has shape {shapes[1]}, expected that of start_world {shapes[0]}"
         )
     radii = checked_radii(radii, start_world, "start_world")
-    if isinstance(evaluations, bool) or not isinstance(evaluations, int) or evaluations < 2:
+    if not isinstance(evaluations, numbers.Integral) or evaluations < 2:
         raise ValueError(f"evaluations is {evaluations!r}, expected a whole number >= 2")
     if not isinstance(slope, jax.core.Tracer) and not (math.isfinite(slope) and slope > 0):
         raise ValueError(f"slope is {slope}, expected > 0 and finite")
@@ -77,7 +79,7 @@ def swept_clearance(
     slope = jnp.asarray(slope, jnp.float32)
     answering = as_field(field)
     frozen = jax.lax.stop_gradient((answering, start, end, slope))
-    low, high = _lowest_segment(*frozen, unknown=unknown, evaluations=evaluations)
+    low, high = _lowest_segment(*frozen, unknown=unknown, evaluations=int(evaluations))
     way = end - start
     values = sdf(answering, jnp.stack([start + t[..., None] * way for t in (low, high)]), unknown)
     return _bound(values[0], values[1], (high - low) * _length(way), slope) - radii
