@@ -1,5 +1,6 @@
 """Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463)."""
 
+from hiosdf_jax import planning
 from hiosdf_jax.background import BackgroundMapper
 from hiosdf_jax.bake import bake
 from hiosdf_jax.checkpoint import load, save
@@ -23,6 +24,7 @@ __all__ = [
     "grow",
     "init",
     "load",
+    "planning",
     "query",
     "save",
     "sdf",

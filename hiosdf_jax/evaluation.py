@@ -57,6 +57,8 @@ _METRICS = {
     "recall": ("collisions found", "-", "higher"),
     "fpr": ("free spheres called colliding", "-", "lower"),
     "thin_share": ("thin parts kept within 2 cm", "-", "higher"),
+    "lower_coverage": ("lower bounds that hold", "-", "higher"),
+    "lower_slack_cm": ("truth above its lower bound, mean", "cm", "lower"),
     "early_then_cm": ("error where the first frames saw, after them", "cm", "lower"),
     "early_now_cm": ("error where the first frames saw, at the end", "cm", "lower"),
 }
@@ -181,6 +183,27 @@ def evaluate_bands(
         band: _paper_metrics(answers, (low <= distance) & (distance < high), sensor_position_world)
         for band, (low, high) in _BANDS.items()
     }
+
+
+def evaluate_lower(
+    lower: Callable[[np.ndarray], Any], truth: GroundTruth, last_frame: int | None = None
+) -> dict[str, float]:
+    """Scores the lower bounds of the distance that a map gives.
+
+    Args:
+        lower: Maps (n, 3) float32 points in the world, metres, to (n,) bounds in metres. Always
+            called with the same n.
+        truth: Exact distances at points that the sensor saw.
+        last_frame: Only points that were first sampled up to this frame count; None for all.
+
+    Returns:
+        `lower_coverage`, the share of the points at which the true distance is not below the
+        bound; `lower_slack_cm`, the mean of what lies between them.
+    """
+    selected = np.full(len(truth.sdf), True) if last_frame is None else truth.frame <= last_frame
+    bound, _ = _in_chunks(lambda points: (lower(points), points), truth.points_world[selected])
+    slack = truth.sdf[selected].astype(float) - bound
+    return {"lower_coverage": _mean(slack >= 0), "lower_slack_cm": 100 * _mean(slack)}
 
 
 def held_out_surface(

@@ -140,6 +140,9 @@ def run_stream(
                 sensor_position_world=mapped.path_world[-1],
                 last_frame=mapped.last_frame,
             )
+        metrics["scores"] |= evaluation.evaluate_lower(
+            lambda points: _lower(field, points), truth, mapped.last_frame
+        )
     elif held_out:
         metrics["held_out"] = _score_held_out(field, mapped.held_out_world)
     print(_summary(metrics))
@@ -464,3 +467,4 @@ def _write_mesh(output: Path, surface: trimesh.Trimesh, up_world: np.ndarray) ->
 # The map is an argument, so that these compile once for maps of one configuration.
 _sdf_and_grad = jax.jit(sdf_and_grad)
 _observed = jax.jit(lambda field, points: query(field, points).observed)
+_lower = jax.jit(lambda field, points: query(field, points).lower)

@@ -1,7 +1,8 @@
 """What is served to a planner: the grid and the network, combined into one distance.
 
 Near surfaces the grid's patches are the more accurate, and the network smooths the edges between
-them; beyond the grid's horizon the network goes on alone.
+them; beyond the grid's horizon the network goes on alone, and where nothing has been seen, since
+the side of a surface is a guess of the grid's there that may jump.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from hiosdf_jax.state import Field
 
 # Where the grid's answer fades out, as shares of its horizon.
 _FADE = (0.8, 1.0)
+
+# As far beyond what was seen, voxels: what lies just behind a surface is sure to be inside.
+_FADE_UNSEEN_VOXELS = (1.0, 3.0)
 
 # The network may correct the grid by so much, voxels: in unseen space it is a guess.
 _LARGEST_CORRECTION_VOXELS = 1.0
@@ -52,7 +56,8 @@ def served_sdf(field: Field, points_world: jax.Array) -> jax.Array:
     network = network_sdf(field, points_world)
     if config.grid_share == 0:
         return network
-    return _combine(field, lookup.grid_sdf(config, field.surface, points_world), network)
+    grid = lookup.grid_sdf(config, field.surface, points_world)
+    return _combine(field, points_world, grid, network)
 
 
 def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -75,15 +80,21 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     gap = jnp.minimum(jnp.abs(network - nearest.sdf), limit)
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
     doubt = lookup.doubt(config, field.surface, points_world)
-    return jnp.minimum(_combine(field, nearest.sdf, network), doubt), scale
+    served = _combine(field, points_world, nearest.sdf, network)
+    return jnp.minimum(served, doubt), scale
 
 
-def _combine(field: Field, grid: jax.Array, network: jax.Array) -> jax.Array:
+def _combine(
+    field: Field, points_world: jax.Array, grid: jax.Array, network: jax.Array
+) -> jax.Array:
     config = field.config
     if config.grid_share == 0:
         return network
     limit = _LARGEST_CORRECTION_VOXELS * config.voxel_size
     near = grid + (1 - config.grid_share) * jnp.clip(network - grid, -limit, limit)
     start, end = (share * config.distance_horizon for share in _FADE)
-    fade = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)
-    return near + fade * (network - near)
+    far = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)
+    start, end = (voxels * config.voxel_size for voxels in _FADE_UNSEEN_VOXELS)
+    frontier = lookup.frontier(config, field.surface, points_world)
+    unseen = jnp.clip((-frontier - start) / (end - start), 0, 1)
+    return near + jnp.maximum(far, unseen) * (network - near)

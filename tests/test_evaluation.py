@@ -13,6 +13,7 @@ from hiosdf_jax.evaluation import (
     choose_thin,
     evaluate,
     evaluate_bands,
+    evaluate_lower,
     format_bands,
     format_table,
     held_out_surface,
@@ -296,3 +297,19 @@ def test_the_recorded_distances_score_perfectly_on_themselves():
     assert max(scores["visible_cm"], scores["surface_cm"], scores["fpr"]) == 0
     assert scores["recall"] == 1
     assert scores["cosine"] == pytest.approx(0, abs=1e-6)
+
+
+def test_lower_bounds_are_scored_by_coverage_and_slack():
+    truth = sphere_truth()
+
+    def lower(points):
+        sdf, _ = sphere(points)
+        return np.where(points[:, 0] > CENTER[0], sdf - 0.03, sdf + 0.01)
+
+    scores = evaluate_lower(lower, truth)
+    share = np.mean(truth.points_world[:, 0] > CENTER[0])
+    assert scores["lower_coverage"] == share
+    assert scores["lower_slack_cm"] == pytest.approx(3 * share - (1 - share), abs=1e-3)
+    early = truth.frame <= 3
+    share = np.mean(truth.points_world[early, 0] > CENTER[0])
+    assert evaluate_lower(lower, truth, 3)["lower_coverage"] == share

@@ -119,6 +119,12 @@ def measure(
                 scores = _score_held_out(field, ask, held_out_world)
             else:
                 scores = evaluation.evaluate(ask, source.truth, pose[:3, 3], frame)
+                if name == "served":
+                    scores |= evaluation.evaluate_lower(
+                        lambda points: _lower(field, points),  # noqa: B023 - called at once
+                        source.truth,
+                        frame,
+                    )
             if ends_early:
                 early[name] = scores["visible_cm"]
             if is_due or is_last:
@@ -162,6 +168,7 @@ VARIANTS: dict[str, Callable[..., tuple[jax.Array, jax.Array]]] = {
     "network": jax.jit(_network_sdf_and_grad),
     "served": jax.jit(hio.sdf_and_grad),
 }
+_lower = jax.jit(lambda field, points: hio.query(field, points).lower)
 _observed = jax.jit(lambda field, points: hio.query(field, points).observed)
 
 

@@ -25,6 +25,9 @@ _FREE_RATIO = 0.1
 # How far behind a patch free space makes it a sheet: beyond the margin that passes keep, voxels.
 _SHEET_VOXELS = 2.0
 
+# Where no ray came by, the plane of a patch tells its side up to here, voxels.
+_GUESS_VOXELS = 3.0
+
 # Voxels whose patches are evaluated together.
 _TILE_VOXELS = 1 << 17
 
@@ -224,5 +227,7 @@ def _side(
     probe = jnp.clip(probe, 0, jnp.asarray(free.shape) - 1)
     sheet = free[probe[0], probe[1], probe[2]]
     by_plane = in_front | sheet
-    by_rays = free[here[0], here[1], here[2]] | ((behind == 0) & in_front)
-    return jnp.where(jnp.where(flat & (distance < 1), by_plane, by_rays), 1.0, -1.0)
+    unmet = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
+    by_rays = jnp.where(behind > 0, -1.0, unmet)
+    by_rays = jnp.where(free[here[0], here[1], here[2]], 1.0, by_rays)
+    return jnp.where(flat & (distance < 1), jnp.where(by_plane, 1.0, -1.0), by_rays)
