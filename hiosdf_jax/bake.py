@@ -69,7 +69,9 @@ def _bake(
         return answer.sdf, answer.frontier, answer.lower
 
     count = math.prod(shape)
-    sdf, frontier, lower = jax.lax.map(sample, jnp.arange(count), batch_size=min(count, _CHUNK))
+    sdf, frontier, lower = jax.lax.map(
+        sample, jnp.arange(count, dtype=jnp.int32), batch_size=min(count, _CHUNK)
+    )
     # Between samples a 1-Lipschitz function may be less by the mean distance to the corners, at
     # most half a cell's diagonal.
     margin = math.sqrt(3) / 2 * resolution

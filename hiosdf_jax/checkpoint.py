@@ -7,6 +7,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from hiosdf_jax.state import MapState
 
 _FORMAT = "hiosdf_jax map"
 _VERSION = 2
+
+# What numpy and zipfile raise for files that are damaged, or no archives.
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, KeyError)
 
 
 def save(path: str | os.PathLike[str], state: MapState) -> None:
@@ -74,22 +78,23 @@ def load(path: str | os.PathLike[str]) -> MapState:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
+    except FileNotFoundError:
+        raise
+    except _UNREADABLE as error:
         raise ValueError(f"{path} is not a readable .npz file: {error}") from error
     try:
         header = json.loads(str(arrays.pop("header")))
         if header["format"] != _FORMAT:
             raise KeyError
+        version, fields, key_impl = header["version"], header["config"], header["key"]
     except (KeyError, TypeError, json.JSONDecodeError):
         raise ValueError(f"{path} is not a hiosdf_jax map: it has no such header") from None
-    if header["version"] > _VERSION:
-        raise ValueError(
-            f"{path} has format version {header['version']}, expected at most {_VERSION}"
-        )
-    config = Config(**header["config"])
-    key_impl = header["key"]
+    if version != _VERSION:
+        raise ValueError(f"{path} has format version {version}, expected {_VERSION}")
+    try:
+        config = Config(**fields)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} has no valid configuration: {error}") from error
     template = jax.eval_shape(lambda: _without_key(init(config, jax.random.key(0, impl=key_impl))))
     expected = _named_leaves(template)
     for name, leaf in expected.items():

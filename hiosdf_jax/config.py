@@ -32,7 +32,8 @@ class Config:
         range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m;
             only its relative size matters: hits are averaged with weight 1 / sigma^2.
         min_hits: Hits a voxel needs before its surface counts.
-        min_hit_ratio: Share hits / (hits + passes) below which a surface is carved away.
+        min_hit_ratio: Share hits / (hits + passes) below which a surface that fills its voxel is
+            carved away; of smaller ones less is asked, by their area.
         evidence_limit: Rays a voxel remembers; older evidence fades once there are more.
         distance_horizon: Largest distance that the grid resolves, m; at most 127 voxels.
         frontier_horizon: Largest distance to unseen space that the grid resolves, m.
@@ -70,7 +71,7 @@ class Config:
     max_range: float = 20.0
     range_noise: tuple[float, float] = (0.005, 0.002)
     min_hits: int = 2
-    min_hit_ratio: float = 0.2
+    min_hit_ratio: float = 0.25
     evidence_limit: float = 100.0
     distance_horizon: float = 3.0
     frontier_horizon: float = 1.0
@@ -99,33 +100,54 @@ class Config:
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", _checked_bounds(self.bounds))
         noise = self.range_noise
-        if not (isinstance(noise, tuple | list) and len(noise) == 2):
-            raise ValueError(f"Config.range_noise is {noise!r}, expected two numbers (a, b)")
-        object.__setattr__(self, "range_noise", tuple(float(value) for value in noise))
+        try:
+            floor, growth = (float(value) for value in noise)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"Config.range_noise is {noise!r}, expected two numbers (a, b)"
+            ) from None
+        object.__setattr__(self, "range_noise", (floor, growth))
         for name, low, high in _LIMITS:
             value = getattr(self, name)
             whole = Config.__dataclass_fields__[name].type == "int"
             if isinstance(value, bool) or not isinstance(value, numbers.Real):
                 raise ValueError(f"Config.{name} is {value!r}, expected a number")
-            number = float(value)
+            try:
+                number = float(value)
+            except OverflowError:
+                number = math.inf
             if not low <= number <= high:  # also catches NaN
                 raise ValueError(f"Config.{name} is {value!r}, expected {low} <= {name} <= {high}")
             if whole and not number.is_integer():
                 raise ValueError(f"Config.{name} is {value!r}, expected a whole number")
             object.__setattr__(self, name, int(number) if whole else number)
-        if not (self.range_noise[0] > 0 and 0 <= self.range_noise[1] < math.inf):
+        if not (0 < floor < math.inf and 0 <= growth < math.inf):
             raise ValueError(f"Config.range_noise is {noise!r}, expected a > 0 and b >= 0")
         if self.max_range <= self.min_range:
             raise ValueError(
                 f"Config.max_range is {self.max_range!r}, expected more than min_range, "
                 f"{self.min_range!r}"
             )
-        if self.horizon_voxels > 127:
+        for name, horizon in (
+            ("distance_horizon", self.horizon_voxels),
+            ("frontier_horizon", self.frontier_voxels),
+        ):
+            if horizon > 127:
+                raise ValueError(
+                    f"Config.{name} is {getattr(self, name)!r}, expected at most 127 "
+                    f"voxels of {self.voxel_size} m, {127 * self.voxel_size:.4g} m"
+                )
+        samples = self.near_samples + self.far_samples + self.local_points * self.local_ray_samples
+        if self.batches > samples:
             raise ValueError(
-                f"Config.distance_horizon is {self.distance_horizon!r}, expected at most 127 "
-                f"voxels of {self.voxel_size} m, {127 * self.voxel_size:.4g} m"
+                f"Config.batches is {self.batches!r}, expected at most one a sample, {samples}"
             )
         voxels = math.prod(self.grid_shape)
+        if voxels < 1:
+            raise ValueError(
+                f"Config.bounds is {self.bounds!r}, expected a box that holds voxels of "
+                f"{self.voxel_size} m"
+            )
         if voxels > 2**31 - 1:
             raise ValueError(
                 f"Config.bounds is {self.bounds!r}: {voxels} voxels of {self.voxel_size} m, "

@@ -17,7 +17,7 @@ _CHUNK = 8192
 _NEAR = 0.5  # m, "near" in near_cm and near_bias_cm
 _LOCAL_RADIUS = 3.0  # m, the paper's local SDF error
 _RADIUS_BOUNDS = (0.05, 0.4)  # m, robot spheres from a gripper's finger to a mobile base
-_KEPT = 0.02  # m, a point of a thin part whose |sdf| is more than this has been lost
+_KEPT = 0.02  # m, a point of a thin part whose sdf is more than this has been lost
 _THIN_RETURNS = 10  # that a thin part needs to count
 _THIN_POINTS = 50  # at most so many points of each part, so that a leg counts as much as a shelf
 _BANDS = {  # of the true distance, m: least (in the band), upper end (not in it)
@@ -125,7 +125,7 @@ def evaluate(
         | |grad| - 1 |; `cosine` mean of 1 - cos(grad, true grad), 1 where a gradient is zero;
         `recall` and `fpr` of "a sphere collides when the distance at its centre < its radius",
         for spheres of 0.05 to 0.4 m radius (drawn from one fixed seed) centred on the points;
-        `thin_share` share of the points on thin parts where |sdf| <= 2 cm (only if truth has such
+        `thin_share` share of the points on thin parts where sdf <= 2 cm (only if truth has such
         points and no frame is left out).
 
     Raises:
@@ -151,7 +151,7 @@ def evaluate(
     }
     if answers.complete and len(truth.thin_points_world):
         thin = _in_chunks(sdf_and_grad, truth.thin_points_world)[0]
-        scores["thin_share"] = _mean(np.where(np.isnan(thin), np.nan, np.abs(thin) <= _KEPT))
+        scores["thin_share"] = _mean(np.where(np.isnan(thin), np.nan, thin <= _KEPT))
     return {key: scores[key] for key in METRICS if key in scores}
 
 

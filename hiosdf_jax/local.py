@@ -44,7 +44,8 @@ def sample_local(
     directions = (ends - sensor_world) / jnp.maximum(end_ranges, 1e-6)[:, None]
 
     shape = (config.local_points, config.local_ray_samples)
-    strata = (jnp.arange(shape[1]) + jax.random.uniform(depth_key, shape)) / shape[1]
+    first = jnp.arange(shape[1], dtype=jnp.float32)
+    strata = (first + jax.random.uniform(depth_key, shape, jnp.float32)) / shape[1]
     depths = strata * (end_ranges[:, None] + config.local_truncation)
     queries_world = sensor_world + depths[..., None] * directions[:, None, :]
     queries_world = queries_world.reshape(-1, 3)
@@ -52,7 +53,8 @@ def sample_local(
     distance = nearest_distance(queries_world, points_world, valid)
     sign = jnp.where(depths < end_ranges[:, None], 1.0, -1.0).ravel()
     kept = possible & (distance < config.local_truncation)
-    return Samples(queries_world, sign * distance, kept.astype(jnp.float32))
+    # Not inf where there is no cloud: inf times a weight of 0 is NaN.
+    return Samples(queries_world, jnp.where(possible, sign * distance, 0), kept.astype(jnp.float32))
 
 
 def nearest_distance(queries: jax.Array, points: jax.Array, valid: jax.Array) -> jax.Array:

@@ -44,21 +44,24 @@ def init(config: Config, key: jax.Array) -> MapState:
         raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
     key = _typed_key(key)
     key, network_key = jax.random.split(key)
-    zero = jnp.zeros((), jnp.int32)
+
+    def zero() -> jax.Array:  # an array of its own each, so that the state can be donated
+        return jnp.zeros((), jnp.int32)
+
     return MapState(
         config=config,
         grid=_empty_grid(config),
         network=training.init_network(config, network_key),
         optimism=uncertainty.initial(),
         key=key,
-        updates=zero,
+        updates=zero(),
         report=Report(
-            points_used=zero,
-            points_outside=zero,
-            points_out_of_range=zero,
-            points_invalid=zero,
-            sdf_loss=jnp.zeros(()),
-            eikonal_loss=jnp.zeros(()),
+            points_used=zero(),
+            points_outside=zero(),
+            points_out_of_range=zero(),
+            points_invalid=zero(),
+            sdf_loss=jnp.zeros((), jnp.float32),
+            eikonal_loss=jnp.zeros((), jnp.float32),
             flags=jnp.zeros((), jnp.uint32),
         ),
     )
@@ -138,6 +141,8 @@ def grow(state: MapState, bounds: Any) -> MapState:
 
 def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
+    if cloud.shape[0] == 0:
+        cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     rigid = _is_rigid(pose)
     usable = rigid & jnp.any(finite)
@@ -174,7 +179,7 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     )
 
     # The coarse grid (paper, IV-B).
-    grid = _with_evidence_as(state.grid, jnp.float32)
+    grid = _widen(state.grid)
     grid = surface.fuse_hits(config, grid, points_world, ends, sensor_world)
     grid = rays.trace_rays(
         config,
@@ -185,7 +190,7 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
         ends,
         sensor_world,
     )
-    grid = _with_evidence_as(rays.fade_evidence(config, grid, sensor_world), _STORED)
+    grid = _narrow(rays.fade_evidence(config, grid, sensor_world))
     grid = distance.update_distances(config, grid, sensor_world)
     grid = frontier.update_frontier(config, grid, sensor_world)
 
@@ -247,13 +252,23 @@ def _empty_grid(config: Config) -> Grid:
     )
 
 
-def _with_evidence_as(grid: Grid, dtype: Any) -> Grid:
-    """What the rays counted, in another precision: one cloud may add more than float16 holds."""
+def _widen(grid: Grid) -> Grid:
+    """What the rays counted, in float32: one cloud may add more than float16 holds."""
     return grid.replace(
-        hits=grid.hits.astype(dtype),
-        passes=grid.passes.astype(dtype),
-        behind=grid.behind.astype(dtype),
-        weight=grid.weight.astype(dtype),
+        hits=grid.hits.astype(jnp.float32),
+        passes=grid.passes.astype(jnp.float32),
+        behind=grid.behind.astype(jnp.float32),
+        weight=grid.weight.astype(jnp.float32) ** 2,
+    )
+
+
+def _narrow(grid: Grid) -> Grid:
+    """The inverse; weights as their roots, since those of far returns are very small."""
+    return grid.replace(
+        hits=grid.hits.astype(_STORED),
+        passes=grid.passes.astype(_STORED),
+        behind=grid.behind.astype(_STORED),
+        weight=jnp.sqrt(grid.weight).astype(_STORED),
     )
 
 

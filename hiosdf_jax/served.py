@@ -90,7 +90,8 @@ def _combine(
     config = field.config
     if config.grid_share == 0:
         return network
-    limit = _LARGEST_CORRECTION_VOXELS * config.voxel_size
+    # No more than the distance itself: surfaces stay where the grid has them, thin ones too.
+    limit = jnp.minimum(_LARGEST_CORRECTION_VOXELS * config.voxel_size, jnp.abs(grid))
     near = grid + (1 - config.grid_share) * jnp.clip(network - grid, -limit, limit)
     start, end = (share * config.distance_horizon for share in _FADE)
     far = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)

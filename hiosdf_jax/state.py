@@ -82,7 +82,7 @@ class Grid(flax.struct.PyTreeNode):
         hits: Rays that ended in the voxel (fading), (X, Y, Z) float16.
         passes: Rays that went through it well before their end (fading), (X, Y, Z) float16.
         behind: Rays that ended a little before it (fading), (X, Y, Z) float16.
-        weight: Sum of the weights of the hits (fading), (X, Y, Z) float16.
+        weight: Root of the sum of the weights of the hits (fading), (X, Y, Z) float16.
         surface: The patches that the hits make, and what is derived from all this.
     """
 

@@ -163,7 +163,7 @@ def test_thin_parts_are_kept_within_2_cm():
     direction = np.tile([[0, 0, 1]], (5, 1))
     thin = (CENTER + direction * (RADIUS + shift[:, None])).astype(np.float32)
     truth = truth._replace(thin_points_world=thin)
-    assert evaluate(sphere, truth)["thin_share"] == pytest.approx(3 / 5)
+    assert evaluate(sphere, truth)["thin_share"] == pytest.approx(4 / 5)
     assert "thin_share" not in evaluate(sphere, truth, last_frame=4)  # they carry no frame
     assert math.isnan(evaluate(lambda p: (p[:, 0] * np.nan, p), truth)["thin_share"])
 

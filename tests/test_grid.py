@@ -32,7 +32,7 @@ update_frontier = jax.jit(frontier.update_frontier, static_argnums=0)
 
 def empty_grid(config=CONFIG):
     """As stages see it: what the rays counted in float32."""
-    return mapping._with_evidence_as(mapping._empty_grid(config), jnp.float32)
+    return mapping._widen(mapping._empty_grid(config))
 
 
 def uniform(seed, count, low=BOUNDS[0], high=BOUNDS[1]):
@@ -162,7 +162,10 @@ def test_the_order_of_rows_does_not_matter():
     a, b = fuse(empty_grid(), points), fuse(empty_grid(), points[::-1].copy())
     np.testing.assert_array_equal(a.hits, b.hits)
     np.testing.assert_allclose(a.surface.mean, b.surface.mean, atol=1e-3)
-    spread = [jnp.einsum("...ki,...kj->...ij", g.axes, g.axes).astype(np.float32) for g in (a, b)]
+    spread = [
+        jnp.einsum("...ki,...kj->...ij", g.surface.axes, g.surface.axes).astype(np.float32)
+        for g in (a, b)
+    ]
     np.testing.assert_allclose(*spread, atol=1e-3)
 
 
@@ -246,7 +249,7 @@ def test_a_vanished_wall_is_carved_and_a_new_one_believed():
     for cloud in [near] * 30 + [far] * 60:
         grid = trace(fuse(grid, cloud, sensor), cloud, sensor)
         grid = fade_evidence(CONFIG, grid, jnp.asarray(sensor, jnp.float32))
-        features = surface.is_feature(CONFIG, grid.hits, grid.passes)
+        features = surface.is_feature(CONFIG, grid.hits, grid.passes, grid.surface.axes)
         history.append((bool(features[7, 5, 4]), bool(features[11, 5, 4])))
     assert float(jnp.max(grid.hits + grid.passes)) <= CONFIG.evidence_limit * 1.001
     assert history[29] == (True, False)
@@ -352,7 +355,7 @@ def test_grid_distance_of_a_room_is_exact_in_value_sign_and_gradient():
 
 def test_grid_distance_against_brute_force_over_all_patches():
     grid = wall_room(CONFIG, seeds=range(2))
-    features = np.asarray(surface.is_feature(CONFIG, grid.hits, grid.passes))
+    features = np.asarray(surface.is_feature(CONFIG, grid.hits, grid.passes, grid.surface.axes))
     cells = np.argwhere(features)
     mean = np.asarray(grid.surface.mean, np.float64)[features] + cells + CONFIG.corner_index + 0.5
     axes = np.asarray(grid.surface.axes, np.float64)[features]

@@ -80,13 +80,41 @@ def test_extreme_points_give_finite_answers(field):
             [-1.0, -2.0, 0.0],
             [3.0, 1.0, 2.0],
             [1e-6 + 3.0, 1.0, 2.0],
+            [np.nan, 0, 0],
         ],
         np.float32,
     )
     answer = hio.query(field, extremes)
-    assert np.isfinite(np.asarray(answer.sdf)).all()
-    assert np.isfinite(np.asarray(answer.grad)).all()
+    for array in (answer.sdf, answer.grad, answer.frontier, answer.lower):
+        assert np.isfinite(np.asarray(array)).all()
     assert not np.asarray(answer.observed).any()
+    solid = hio.query(field, extremes, unknown="obstacle")
+    assert np.isfinite(np.asarray(solid.grad)).all()
+
+
+def test_on_the_faces_of_the_box_the_gradient_is_that_of_the_inside(field):
+    face, inside = np.array([3.0, -0.5, 1.0]), np.array([2.9999, -0.5, 1.0])
+    np.testing.assert_allclose(
+        hio.sdf_and_grad(field, face)[1], hio.sdf_and_grad(field, inside)[1], atol=2e-2
+    )
+
+
+def test_forward_mode_and_second_derivatives(field):
+    points, toward = points_around(20, 0.9), np.full((20, 3), 0.5, np.float32)
+    value, slope = jax.jvp(lambda p: hio.sdf(field, p), (points,), (toward,))
+    exact, gradient = hio.sdf_and_grad(field, points)
+    np.testing.assert_allclose(value, exact, atol=1e-5)
+    np.testing.assert_allclose(slope, np.sum(gradient * toward, axis=-1), atol=1e-4)
+    hessian = jax.hessian(lambda p: hio.sdf(field, p))(points[0])
+    step = 1e-2 * np.eye(3, dtype=np.float32)
+    high, low = (hio.sdf_and_grad(field, points[0] + s * step)[1] for s in (1, -1))
+    np.testing.assert_allclose(hessian, (high - low) / 2e-2, atol=0.05)
+
+
+def test_lower_outside_is_less_by_the_distance_to_the_box(field):
+    corner, beyond = np.array([3.0, 1.0, 2.0]), np.array([6.0, 5.0, 2.0])
+    low, far = hio.query(field, corner).lower, hio.query(field, beyond).lower
+    np.testing.assert_allclose(far, low - 5.0, rtol=1e-5)
 
 
 def test_the_map_is_a_traced_argument():

@@ -136,7 +136,7 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
         )
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
-    features = surface.is_feature(config, hits, passes)
+    features = surface.is_feature(config, hits, passes, axes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels)
     nearest = nearest.ravel()
     _, squared = nearest_sites(surface.is_doubtful(hits, passes), mean, config.horizon_voxels)
@@ -151,7 +151,7 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
         row = jnp.maximum(nearest[voxel], 0)
         jump = jnp.stack(jnp.unravel_index(row, shape)) - here
         patch_axes = flat_axes[row].astype(jnp.float32)
-        offset = surface.patch_offset(jnp.zeros(3), flat_mean[row] + jump, patch_axes)
+        offset = surface.patch_offset(jnp.zeros(3, jnp.float32), flat_mean[row] + jump, patch_axes)
         distance = surface.safe_norm(offset)
         side = _side(free, flat_behind[voxel], here, offset, distance, patch_axes)
         found = nearest[voxel] >= 0
@@ -160,7 +160,7 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
 
     # In tiles: the patches of all voxels at once would take many times the map's memory.
     tile = min(_TILE_VOXELS, nearest.size)
-    jump, sdf = jax.lax.map(place, jnp.arange(nearest.size), batch_size=tile)
+    jump, sdf = jax.lax.map(place, jnp.arange(nearest.size, dtype=jnp.int32), batch_size=tile)
     jump, sdf = jump.reshape(*shape, 3), sdf.reshape(shape)
 
     inner = geometry.window_shape(config, changed)

@@ -102,7 +102,8 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
 def clamp(config: Config, points_world: jax.Array) -> jax.Array:
     """Moves (..., 3) points outside the bounds, m, to the nearest point of the box."""
     low, high = jnp.asarray(config.bounds, points_world.dtype)
-    return jnp.clip(points_world, low, high)
+    # Not jnp.clip, which halves the gradient on the faces.
+    return jnp.where(points_world < low, low, jnp.where(points_world > high, high, points_world))
 
 
 def window_shape(config: Config, reach: float) -> tuple[int, int, int]:
@@ -136,9 +137,14 @@ def read_window(
 ) -> jax.Array:
     """Cuts the window out of a grid array; axes after the third come along whole."""
     rest = array.shape[3:]
-    return jax.lax.dynamic_slice(array, (*start, *(0 for _ in rest)), (*shape, *rest))
+    return jax.lax.dynamic_slice(array, _full_start(start, rest), (*shape, *rest))
 
 
 def write_window(array: jax.Array, start: tuple[jax.Array, ...], values: jax.Array) -> jax.Array:
     """Puts a window's values back into a grid array."""
-    return jax.lax.dynamic_update_slice(array, values, (*start, *(0 for _ in array.shape[3:])))
+    return jax.lax.dynamic_update_slice(array, values, _full_start(start, array.shape[3:]))
+
+
+def _full_start(start: tuple[jax.Array, ...], rest: tuple[int, ...]) -> tuple[jax.Array, ...]:
+    # Of one type: a plain 0 would be an int64 where the user has enabled those.
+    return (*start, *(jnp.zeros((), jnp.int32) for _ in rest))

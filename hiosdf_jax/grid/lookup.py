@@ -149,13 +149,19 @@ def frontier(config: Config, known: Surface, points_world: jax.Array) -> jax.Arr
     metres = known.frontier.ravel()
     around = metres[corners.flat].astype(jnp.float32)
     around = jnp.where(corners.inside, around, -config.frontier_horizon)
-    index, _, _ = geometry.voxel_of(config, points_world)
-    here = metres[geometry.flat_index(config.grid_shape, index)]
-    # Next to a seen voxel the unseen space begins half a voxel before the unseen one's centre,
-    # whatever that one knows: beyond the bounds, and after `grow`, it knows nothing yet.
-    least = -0.5 * config.voxel_size
-    around = jnp.where((here > 0)[..., None], jnp.maximum(around, least), around)
+    index, _, inside = geometry.voxel_of(config, points_world)
+    seen = inside & (metres[geometry.flat_index(config.grid_shape, index)] > 0)
+    # Beyond the bounds, and after `grow` until the next update, voxels know nothing. Next to a seen
+    # voxel the unseen space begins half a voxel before the unseen one's centre; elsewhere they are
+    # taken to be as deep in it as the deepest that knows.
+    ignorant = around <= -config.frontier_horizon
+    deepest = jnp.min(jnp.where(ignorant, jnp.inf, around), axis=-1)
+    deepest = jnp.where(jnp.isfinite(deepest), deepest, -config.frontier_horizon)
+    filled = jnp.where(ignorant, jnp.minimum(deepest, 0)[..., None], around)
+    around = jnp.where(seen[..., None], jnp.maximum(around, -0.5 * config.voxel_size), filled)
     between = jnp.sum(around * corners.weight, axis=-1)
-    return jnp.where(
-        here > 0, jnp.maximum(between, _LEAST_FRONTIER), jnp.minimum(between, -_LEAST_FRONTIER)
+    signed = jnp.where(
+        seen, jnp.maximum(between, _LEAST_FRONTIER), jnp.minimum(between, -_LEAST_FRONTIER)
     )
+    # The sign is certain, but a planner still needs the slope.
+    return between + jax.lax.stop_gradient(signed - between)

@@ -65,13 +65,18 @@ def trace_rays(
 
     def advance(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         done, passes = carry
-        steps = done + jnp.arange(_CHUNK) + phase[:, None]
+        steps = done + jnp.arange(_CHUNK, dtype=jnp.float32) + phase[:, None]
         return done + _CHUNK, count(passes, steps, steps < free[:, None])
 
     _, passes = jax.lax.while_loop(
         lambda carry: carry[0] < longest, advance, (jnp.float32(0), grid.passes.ravel())
     )
-    steps = (ranges / size)[:, None] + 0.5 + jnp.arange(_BEHIND_STEPS) + phase[:, None]
+    steps = (
+        (ranges / size)[:, None]
+        + 0.5
+        + jnp.arange(_BEHIND_STEPS, dtype=jnp.float32)
+        + phase[:, None]
+    )
     hidden = jnp.broadcast_to((valid & ends)[:, None], steps.shape)
     behind = count(grid.behind.ravel(), steps, hidden)
     return grid.replace(passes=passes.reshape(shape), behind=behind.reshape(shape))

@@ -41,6 +41,6 @@ def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
         ]
     )
     index = jnp.stack(jnp.unravel_index(voxel, config.grid_shape), axis=-1)
-    place = jax.random.uniform(place_key, index.shape, minval=-0.5, maxval=0.5)
+    place = jax.random.uniform(place_key, index.shape, jnp.float32, minval=-0.5, maxval=0.5)
     points_world = geometry.voxel_center(config, index) + place * config.voxel_size
     return Samples(points_world, lookup.grid_sdf(config, grid.surface, points_world), weight)

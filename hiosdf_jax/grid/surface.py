@@ -24,6 +24,10 @@ _LEAST_DEVIATION = 1e-3
 
 _JACOBI_SWEEPS = 5
 
+# Patches smaller than this (voxels^2) are asked for as many hits as one of this area: stray returns
+# are small as well.
+_LEAST_AREA = 0.2
+
 # Voxels whose rays ended in them at least this often may hold a surface, whatever else they say.
 _DOUBT_RATIO = 0.02
 
@@ -111,18 +115,25 @@ def fuse_hits(
     )
 
 
-def is_feature(config: Config, hits: jax.Array, passes: jax.Array) -> jax.Array:
+def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Array) -> jax.Array:
     """Tells the voxels whose patch counts as surface: hit often enough, and seldom seen through.
+
+    A patch that fills its voxel stops every ray, a leg or a pole lets most of them pass beside it:
+    what is asked for falls with the patch's area.
 
     Args:
         config: The map's configuration.
         hits: (...) rays that ended in the voxel.
         passes: (...) rays that went through it.
+        axes: (..., 3, 3) as in `Surface.axes`.
 
     Returns:
         (...) bool.
     """
-    return (hits >= config.min_hits) & (hits >= config.min_hit_ratio * (hits + passes))
+    half = _EXTENT_DEVIATIONS * jnp.sqrt(jnp.sum(axes.astype(jnp.float32) ** 2, axis=-1))
+    area = jnp.prod(jnp.minimum(2 * half[..., :2], 1), axis=-1)
+    ratio = config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
+    return (hits >= config.min_hits) & (hits >= ratio * (hits + passes))
 
 
 def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:

@@ -52,7 +52,7 @@ def siren(config: Config) -> Siren:
 
 def init_params(config: Config, key: jax.Array) -> Any:
     """Draws the network's first weights from U(-sqrt(6 / n) / omega_0, sqrt(6 / n) / omega_0)."""
-    return siren(config).init(key, jnp.zeros((1, 3)))
+    return siren(config).init(key, jnp.zeros((1, 3), jnp.float32))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -96,19 +96,18 @@ def train(
     """
     optimizer = _optimizer(config)
     batches = _split(config, samples, key)
-    # A sum instead of a mean: single samples' shares would vanish in float16.
-    scale = batches.sdf.shape[1]
 
     def objective(params: Any, batch: Samples) -> tuple[jax.Array, Losses]:
         points = batch.points_world - network.origin_world
         parts = losses(config, params, points, batch)
         loss = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
-        return loss * scale, parts
+        # A sum instead of a mean: single samples' shares of it would vanish in float16.
+        return loss * _count(batch), parts
 
     def step(carry: tuple[Any, Any], batch: Samples) -> tuple[tuple[Any, Any], Losses]:
         params, state = carry
         gradients, parts = jax.grad(objective, has_aux=True)(params, batch)
-        gradients = jax.tree.map(lambda gradient: gradient / scale, gradients)
+        gradients = jax.tree.map(lambda gradient: gradient / _count(batch), gradients)
         updates, state = optimizer.update(gradients, state, params)
         return (optax.apply_updates(params, updates), state), parts
 
@@ -157,6 +156,10 @@ def _median(values: jax.Array, weight: jax.Array) -> jax.Array:
 
 def _optimizer(config: Config) -> optax.GradientTransformation:
     return optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
+
+
+def _count(samples: Samples) -> jax.Array:
+    return jnp.maximum(jnp.sum(samples.weight), 1)
 
 
 def _mean(values: jax.Array, weight: jax.Array) -> jax.Array:
