@@ -1,0 +1,162 @@
+"""What the machine can do, measured, and what a stage has to do at the least, counted.
+
+The share of the limit that a stage reaches is the least time that its operations or its bytes take
+on this machine over the time that it took.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks.speed.rows import Row, single, time_ms
+from hiosdf_jax.config import Config
+from hiosdf_jax.grid import geometry
+from hiosdf_jax.network import passes
+
+
+class Limits(NamedTuple):
+    """Rates that were measured.
+
+    Attributes:
+        matrix: Operations a second in a large matrix product, in the type that the network uses.
+        vector: float32 operations a second outside matrix products.
+        memory: Bytes a second that a large copy reads and writes.
+    """
+
+    matrix: float
+    vector: float
+    memory: float
+
+
+class Work(NamedTuple):
+    """What a stage has to do at the least.
+
+    Attributes:
+        matrix: Operations in matrix products, a multiply-add being two.
+        vector: Other operations.
+        memory: Bytes between the processor and its memory.
+    """
+
+    matrix: float = 0.0
+    vector: float = 0.0
+    memory: float = 0.0
+
+
+# Steps of each of the chains that the vector rate is measured on; the chains are independent, so
+# that none waits for itself.
+_STEPS, _CHAINS = 64, 4
+
+
+def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, list[Row]]:
+    """Measures the machine's rates.
+
+    Args:
+        matrix_edge: Rows and columns of the matrices.
+        elements: float32 numbers in the arrays that are copied.
+        seconds: How long to time each.
+
+    Returns:
+        The rates, and rows with them.
+    """
+    dtype = jnp.dtype(passes.stored_dtype())
+    key = jax.random.key(0)
+    square = jax.random.normal(key, (matrix_edge, matrix_edge), dtype)
+    product = time_ms(jax.jit(jnp.matmul), square, square, seconds=seconds)
+    numbers = jax.random.uniform(key, (elements,))
+    copied = time_ms(jax.jit(lambda x: x + 1), numbers, seconds=seconds)
+
+    def chains(x: jax.Array, factor: jax.Array) -> jax.Array:
+        several = [x + k for k in range(_CHAINS)]
+        for _ in range(_STEPS):
+            several = [one * factor + x for one in several]
+        return sum(several, jnp.zeros_like(x))
+
+    few = numbers[: max(1, elements // 16)]
+    chained = time_ms(jax.jit(chains), few, jnp.float32(0.5), seconds=seconds)
+    limits = Limits(
+        matrix=2.0 * matrix_edge**3 / (1e-3 * product.median),
+        vector=2.0 * _STEPS * _CHAINS * few.size / (1e-3 * chained.median),
+        memory=2.0 * numbers.nbytes / (1e-3 * copied.median),
+    )
+
+    rows = [
+        (f"limit: {dtype} matrix product", "TFLOP/s", 1e-12 * limits.matrix),
+        ("limit: float32 multiply-adds", "TFLOP/s", 1e-12 * limits.vector),
+        ("limit: copy, read + write", "GB/s", 1e-9 * limits.memory),
+    ]
+    return limits, [Row(name, unit, single(value)) for name, unit, value in rows]
+
+
+def share(limits: Limits | None, work: Work, median_ms: float) -> tuple[str, float]:
+    """The narrowest of the limits, and the share of it that was reached."""
+    if limits is None:
+        return "", float("nan")
+    least = {name: getattr(work, name) / getattr(limits, name) for name in Limits._fields}
+    name = max(least, key=lambda one: least[one])
+    return name, 1e3 * least[name] / median_ms
+
+
+def _network_work(config: Config, points: float, products: int) -> Work:
+    """Of the network's products, `products` a layer and point.
+
+    A pass through the network multiplies and adds 3 H + L H^2 + H numbers a point. Each product of
+    the L layers between hidden ones reads H numbers a point and writes H (those that sum over the
+    points, by the weights, read both): 2 H, in the type that the network's activations have. That
+    is the least traffic of products that are kernels of their own; what is done between them
+    (sines, losses, the optimiser) is not counted.
+    """
+    width, layers = config.hidden_width, config.hidden_layers
+    pass_adds = 3 * width + layers * width**2 + width
+    size = jnp.dtype(passes.stored_dtype()).itemsize
+    return Work(
+        matrix=2.0 * products * pass_adds * points,
+        memory=2.0 * products * layers * width * size * points,
+    )
+
+
+def training_work(config: Config) -> Work:
+    """Of an update's training.
+
+    A sample with a slope takes 6 products a layer and epoch: the value, the gradient by the point,
+    and two for the backward pass of each. One without takes 3. The residuals at the end take 1.
+    """
+    samples = config.near_samples + config.far_samples
+    samples += config.local_points * config.local_ray_samples
+    sloped = -(-samples // config.eikonal_every)
+    products = config.epochs * (6 * sloped + 3 * (samples - sloped)) + samples
+    return _network_work(config, products, 1)
+
+
+def network_query_work(config: Config, points: int) -> Work:
+    """Of a value and a gradient by the point: 2 products a layer."""
+    return _network_work(config, points, 2)
+
+
+def nearest_work(queries: int, points: int) -> Work:
+    """Of comparing all pairs: three differences, three squares, two sums and a minimum each.
+
+    Both sets are read once: 12 bytes a point; a query's answer is 4 more.
+    """
+    return Work(vector=9.0 * queries * points, memory=12.0 * points + 16.0 * queries)
+
+
+def distance_work(config: Config) -> Work:
+    """Of the distance transform's memory: the window's evidence read and its answers written once.
+
+    Evidence: hits, passes, behind, mean (3) and axes (9) in float16, 30 bytes a voxel. Answers:
+    nearest (3) in int8, sdf and doubt in float16, 7 bytes a voxel of the inner window. How many
+    shifts the passes try depends on the map, so that operations are not counted.
+    """
+    horizon = config.horizon_voxels * config.voxel_size
+    changed = config.max_range + horizon + config.voxel_size
+    x, y, z = geometry.window_shape(config, changed + horizon)
+    inner_x, inner_y, inner_z = geometry.window_shape(config, changed)
+    return Work(memory=30.0 * x * y * z + 7.0 * inner_x * inner_y * inner_z)
+
+
+def baked_work(points: int) -> Work:
+    """Of trilinear interpolation: a point (12 bytes) and 8 samples (32) in, 4 numbers (16) out."""
+    return Work(memory=60.0 * points)

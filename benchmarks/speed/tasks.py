@@ -1,0 +1,486 @@
+"""What is measured: tasks, each of which gives some rows of the table."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+import hiosdf_jax as hio
+from benchmarks.speed import baselines, limits, stages
+from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
+from hiosdf_jax import datasets, mapping, served
+from hiosdf_jax.grid import geometry, lookup, surface
+from hiosdf_jax.query import field_of
+from hiosdf_jax.samples import Samples
+from hiosdf_jax.state import Field, MapState
+
+Frame = tuple[np.ndarray, np.ndarray]  # cloud (N, 3) m in the sensor's frame, T_world_sensor
+Task = Callable[[], list[Row]]
+
+# {label: preset and what is changed of it}, the least memory first: of peaks only the first is a
+# configuration's own for sure.
+CONFIGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "light": ("light", {}),
+    "default": ("default", {}),
+    "paper, slopes of 1 in 4": ("paper", {"eikonal_every": 4}),
+    "paper": ("paper", {}),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Attributes:
+        configs: Labels of `CONFIGS`; of the last, the stages are taken apart.
+        overrides: Fields that are changed in all configurations.
+        paper_overrides: Fields that are changed in the paper's training beside PyTorch's.
+        frames: Updates that are timed after those that warm up.
+        seconds: How long to repeat whatever is repeated.
+        processes: How often the imports are timed.
+        matrix_edge: Of the product that measures the machine.
+        copied: float32 numbers in the copy that measures it.
+        queries: Points a query asks for.
+        baked_queries: The same, of the baked field alone.
+        bake_resolution: m.
+        cloud_sizes: Points a cloud.
+        map_edges: Of square maps as high as the stream's bounds, m.
+        endurance: Updates in a row.
+    """
+
+    configs: tuple[str, ...]
+    overrides: dict[str, Any]
+    paper_overrides: dict[str, Any]
+    frames: int
+    seconds: float
+    processes: int
+    matrix_edge: int
+    copied: int
+    queries: int
+    baked_queries: int
+    bake_resolution: float
+    cloud_sizes: tuple[int, ...]
+    map_edges: tuple[float, ...]
+    endurance: int
+
+
+FULL = Sizes(
+    configs=tuple(CONFIGS),
+    overrides={},
+    paper_overrides={},
+    frames=115,
+    seconds=1.0,
+    processes=5,
+    matrix_edge=8192,
+    copied=1 << 28,
+    queries=102_400,
+    baked_queries=1_048_576,
+    bake_resolution=0.05,
+    cloud_sizes=(1_000, 16_000, 77_000, 300_000),
+    map_edges=(10.0, 20.0, 60.0),
+    endurance=10_000,
+)
+
+QUICK = Sizes(
+    configs=("light",),
+    overrides={},
+    paper_overrides={"near_samples": 500, "far_samples": 1500, "local_points": 50, "epochs": 1},
+    frames=10,
+    seconds=0.3,
+    processes=2,
+    matrix_edge=1024,
+    copied=1 << 24,
+    queries=10_240,
+    baked_queries=102_400,
+    bake_resolution=0.2,
+    cloud_sizes=(1_000, 16_000, 77_000),
+    map_edges=(10.0, 20.0),
+    endurance=100,
+)
+
+
+@dataclasses.dataclass
+class Bench:
+    """What the tasks share, and fill in one after another.
+
+    Attributes:
+        sizes: How much to measure.
+        frames: Of the stream, read beforehand.
+        extent: Its bounds and range.
+        deadline: When to stop, on the clock of `time.perf_counter`.
+        limits: Of the machine, once they are measured.
+        states: The maps that the configurations made of the stream, by label.
+        baselines: By the key that rows name.
+    """
+
+    sizes: Sizes
+    frames: list[Frame]
+    extent: datasets.Extent
+    deadline: float
+    limits: limits.Limits | None = None
+    states: dict[str, MapState] = dataclasses.field(default_factory=dict)
+    baselines: dict[str, list[Baseline]] = dataclasses.field(default_factory=dict)
+
+    def config(self, label: str, **overrides: Any) -> hio.Config:
+        """A configuration of `CONFIGS`, for the stream."""
+        preset, changes = CONFIGS[label]
+        values = {"max_range": self.extent.max_range} | changes | self.sizes.overrides | overrides
+        bounds = values.pop("bounds", self.extent.bounds)
+        return getattr(hio.Config, preset)(bounds, **values)
+
+    def frame(self, index: int) -> Frame:
+        """A frame; the stream begins again at its end."""
+        return self.frames[index % len(self.frames)]
+
+    def out_of_time(self) -> bool:
+        """Whether the deadline is past."""
+        return time.perf_counter() > self.deadline
+
+
+def open_bench(stream: datasets.Stream, sizes: Sizes, deadline: float) -> Bench:
+    """Reads a stream, so that no reading is timed."""
+    count = min(len(stream), 200)
+    frames = [stream[k] for k in tqdm(range(count), desc="reading", unit="frame")]
+    kept = datasets.FrameStream("frames", count, frames.__getitem__)
+    return Bench(sizes, frames, datasets.find_bounds(kept), deadline)
+
+
+def plan(bench: Bench) -> Iterator[tuple[str, Task]]:
+    """All tasks in their order: their names and what runs them."""
+    configs = bench.sizes.configs
+    apart = configs[-1]
+    yield "imports", lambda: import_rows(bench)
+    for label in configs:
+        yield f"update, {label}", functools.partial(update_rows, bench, label)
+    yield "limits", lambda: limit_rows(bench)
+    yield f"stages, {apart}", lambda: stage_rows(bench, apart)
+    for label in configs[:-1]:
+        yield f"training, {label}", functools.partial(training_rows, bench, label)
+    yield "training, the paper's", lambda: paper_training_rows(bench)
+    yield "network queries", lambda: network_query_rows(bench)
+    yield "queries", lambda: query_rows(bench, "default" if "default" in configs else apart)
+    yield "cloud sizes", lambda: cloud_size_rows(bench)
+    yield "map sizes", lambda: map_size_rows(bench)
+    yield "endurance", lambda: endurance_rows(bench)
+
+
+def import_rows(bench: Bench) -> list[Row]:
+    """Time to import the package, in processes of their own, beside what it stands on."""
+    root = Path(hio.__file__).parents[1]
+    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+
+    def seconds(names: str) -> float:
+        code = f"import time; t = time.perf_counter(); import {names}; print(time.perf_counter()-t)"
+        command = [sys.executable, "-c", code]
+        return float(subprocess.check_output(command, env=environment, text=True, timeout=120))
+
+    alone, ours = "jax, flax, optax", "hiosdf_jax"
+    seconds(ours)  # files are read and compiled to bytecode once
+    pairs = [(seconds(alone), seconds(ours)) for _ in range(bench.sizes.processes)]
+    base, own = (spread_of(column) for column in zip(*pairs, strict=True))
+    bench.baselines["import"] = [Baseline(f"import {alone}", base)]
+    return [Row("import hiosdf_jax", "s", own, compare="import")]
+
+
+def update_rows(bench: Bench, label: str) -> list[Row]:
+    """Whole updates over the stream, the compiled function alone, and what they take."""
+    config = bench.config(label)
+    state, times_ms, compile_s = _map_frames(bench, config, bench.sizes.frames)
+    bench.states[label] = state
+    cloud, pose = bench.frame(len(times_ms) + config.warmup_updates)
+    padded = jnp.asarray(mapping._to_capacity(cloud, pose, config.max_points))
+    alone = time_ms(
+        mapping._update_jit, state, padded, jnp.asarray(pose), seconds=bench.sizes.seconds
+    )
+    arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    # ru_maxrss is in KiB on Linux and in bytes on macOS.
+    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    resident *= 1 if sys.platform == "darwin" else 1024
+    rows = [
+        Row(f"update, {label}", "ms", spread_of(times_ms), "training"),
+        Row(f"update, {label}, on the device alone", "ms", alone, "training"),
+        Row(
+            f"compilation of update, {label}",
+            "s",
+            single(compile_s),
+            note="the first update less the second, tracing included",
+        ),
+        Row(f"arrays of the map, {label}", "MB", single(1e-6 * arrays)),
+        Row(f"resident memory, peak so far, {label}", "MB", single(1e-6 * resident)),
+    ]
+    stats = _device_memory()
+    if "peak_bytes_in_use" not in stats:
+        return [*rows, Row(f"device memory, {label}", note="this device does not report it")]
+    used, peak = (single(1e-6 * stats[key]) for key in ("bytes_in_use", "peak_bytes_in_use"))
+    return [
+        *rows,
+        Row(f"device memory, in use, {label}", "MB", used),
+        Row(f"device memory, peak so far, {label}", "MB", peak),
+    ]
+
+
+def limit_rows(bench: Bench) -> list[Row]:
+    """The machine's rates, for the shares of the rows that follow."""
+    sizes = bench.sizes
+    bench.limits, rows = limits.measure(sizes.matrix_edge, sizes.copied, sizes.seconds)
+    return rows
+
+
+def stage_rows(bench: Bench, label: str) -> list[Row]:
+    """Each stage by itself; scipy's search and distance transform beside two of them."""
+    config, seconds = bench.config(label), bench.sizes.seconds
+    parts = _take_apart(bench, label)
+    cloud, valid, *_ = parts["local samples"].arguments
+    queries = np.asarray(parts["local samples"].result.points_world)
+    cloud, valid = np.asarray(cloud), np.asarray(valid)
+    grid, sensor_world = parts["distance"].arguments
+    features, doubtful = _sites(config, grid, sensor_world)
+    work = {
+        "training": limits.training_work(config),
+        "distance": limits.distance_work(config),
+        "local samples": limits.nearest_work(len(queries), len(cloud)),
+    }
+    compare = {"training": "training", "local samples": "nearest", "distance": "distance"}
+    rows = []
+    for name, part in tqdm(parts.items(), desc=label, leave=False):
+        spread = time_ms(part.function, *part.arguments, seconds=seconds)
+        rows.append(_row(bench, f"{name}, {label}", spread, work.get(name), compare.get(name, "")))
+    bench.baselines["nearest"] = baselines.nearest(queries, cloud[valid], seconds)
+    bench.baselines["distance"] = baselines.distance(features, doubtful, seconds)
+    return rows
+
+
+def training_rows(bench: Bench, label: str) -> list[Row]:
+    """The training of another configuration."""
+    part = _take_apart(bench, label)["training"]
+    spread = time_ms(part.function, *part.arguments, seconds=bench.sizes.seconds)
+    work = limits.training_work(bench.config(label))
+    return [_row(bench, f"training, {label}", spread, work, "training")]
+
+
+def paper_training_rows(bench: Bench) -> list[Row]:
+    """The paper's network and schedule, on samples of a ball: ours, and PyTorch's beside it."""
+    from hiosdf_jax.network import training
+
+    seconds = bench.sizes.seconds
+    config = hio.Config.paper(bench.extent.bounds, **bench.sizes.paper_overrides)
+    network = training.init_network(config, jax.random.key(0))
+    count = config.near_samples + config.far_samples
+    count += config.local_points * config.local_ray_samples
+    points = _points_in(config, count)
+    radius = jnp.linalg.norm(points - network.origin_world, axis=-1)
+    samples = Samples(points, radius - 1, jnp.ones(count))
+    ours = jax.jit(lambda *arguments: training.train(config, *arguments))
+    arguments = (network, samples, jnp.int32(config.epochs), jnp.float32(0.9), jax.random.key(1))
+    spread = time_ms(ours, *arguments, seconds=seconds)
+    bench.baselines["training"] = baselines.training(config, network, samples, seconds)
+    name = f"the paper's training, {config.epochs} epochs of {count:,}"
+    return [_row(bench, name, spread, limits.training_work(config), "training")]
+
+
+def network_query_rows(bench: Bench) -> list[Row]:
+    """Distances and gradients by the paper's network alone; its weights do not matter."""
+    count, seconds = bench.sizes.queries, bench.sizes.seconds
+    config = hio.Config.paper(bench.extent.bounds)
+    state = hio.init(config, jax.random.key(0))
+    points = _points_in(config, count)
+    spread = time_ms(_network, field_of(state), points, seconds=seconds)
+    relative = points - state.network.origin_world
+    bench.baselines["network query"] = baselines.network_query(
+        config, state.network, relative, seconds
+    )
+    work = limits.network_query_work(config, count)
+    name = f"sdf and gradient of {count:,}, the paper's network"
+    return [_row(bench, name, spread, work, "network query")]
+
+
+def query_rows(bench: Bench, label: str) -> list[Row]:
+    """Distances and gradients by each way of asking a map of the stream."""
+    sizes, seconds = bench.sizes, bench.sizes.seconds
+    state = bench.states[label]
+    config, field = state.config, hio.snapshot(state)
+    points = _points_in(config, sizes.queries)
+    rows = []
+
+    def add(name: str, count: int, spread: Spread, work: limits.Work | None = None) -> None:
+        full = f"sdf and gradient of {count:,}, {name}, {label}"
+        rows.append(_row(bench, full, spread, work, "network query"))
+
+    work = limits.network_query_work(config, sizes.queries)
+    add("network", sizes.queries, time_ms(_network, field, points, seconds=seconds), work)
+    add("served", sizes.queries, time_ms(hio.sdf_and_grad, field, points, seconds=seconds))
+    add("grid", sizes.queries, time_ms(_grid, field, points, seconds=seconds))
+    bake = functools.partial(hio.bake, resolution=sizes.bake_resolution)
+    baking = time_ms(bake, field, seconds=seconds)
+    baked = bake(field)
+    samples = f"{baked.sdf.size:,} samples of {sizes.bake_resolution} m"
+    for count in (sizes.queries, sizes.baked_queries):
+        spread = time_ms(hio.sdf_and_grad, baked, _points_in(config, count), seconds=seconds)
+        add("baked", count, spread, limits.baked_work(count))
+    # PyTorch's queries are of another number of points.
+    rows[-1] = dataclasses.replace(rows[-1], compare="")
+    return [*rows, Row(f"bake, {label}", "ms", baking, note=samples)]
+
+
+def cloud_size_rows(bench: Bench) -> list[Row]:
+    """Updates by clouds of several sizes: drawn or padded to one size, and all of them used."""
+    rng = np.random.default_rng(0)
+    cloud, pose = bench.frame(0)
+    cloud = cloud[np.isfinite(cloud).all(axis=-1)]
+    rows, base = [], bench.config("light", warmup_updates=0)
+    for count in tqdm(bench.sizes.cloud_sizes, desc="cloud sizes", leave=False):
+        chosen = rng.choice(len(cloud), count, replace=count > len(cloud))
+        sized = cloud[chosen] + rng.normal(scale=1e-3, size=(count, 3)).astype(np.float32)
+        for how, config in (
+            (f"{base.max_points:,} used", base),
+            ("all used", dataclasses.replace(base, max_points=count)),
+        ):
+            update = functools.partial(hio.update, hio.init(config, jax.random.key(0)))
+            spread = time_ms(update, sized, pose, seconds=bench.sizes.seconds)
+            rows.append(Row(f"update, light, {count:,} points, {how}", "ms", spread))
+    return rows
+
+
+def map_size_rows(bench: Bench) -> list[Row]:
+    """Updates of maps of several sizes around one sensor; the smallest is the baseline."""
+    (_, _, low), (_, _, high) = bench.extent.bounds
+    x, y, _ = bench.frame(0)[1][:3, 3].tolist()
+    rows, first = [], ""
+    for edge in tqdm(bench.sizes.map_edges, desc="map sizes", leave=False):
+        half = edge / 2
+        bounds = ((x - half, y - half, low), (x + half, y + half, high))
+        config = bench.config("light", bounds=bounds, warmup_updates=0)
+        state, _, _ = _map_frames(bench, config, 5)
+        update = functools.partial(hio.update, state)
+        spread = time_ms(update, *bench.frame(5), seconds=bench.sizes.seconds)
+        voxels = "x".join(map(str, config.grid_shape))
+        name = f"a map of {edge:g} m"
+        if not first:
+            first = name
+            bench.baselines["map size"] = [Baseline(name, spread)]
+        key = "" if name == first else "map size"
+        rows.append(Row(f"update, light, {name}", "ms", spread, key, note=f"{voxels} voxels"))
+        del state
+    return rows
+
+
+def endurance_rows(bench: Bench) -> list[Row]:
+    """Updates in a row: whether time, memory or compilations grow."""
+    count = bench.sizes.endurance
+    state, _, _ = _map_frames(bench, bench.config("light"), 1)
+    compilations = []
+
+    def listen(event: str, *_: Any, **__: Any) -> None:
+        if event.endswith("backend_compile_duration"):
+            compilations.append(event)
+
+    def memory() -> dict[str, float]:
+        live = sum(array.nbytes for array in jax.live_arrays())
+        return {"live arrays": live, "device": _device_memory().get("bytes_in_use", np.nan)}
+
+    before, times_ms = memory(), []
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for k in tqdm(range(count), desc="endurance", unit="update", leave=False):
+            cloud, pose = bench.frame(k)
+            start = time.perf_counter()
+            state = jax.block_until_ready(hio.update(state, cloud, pose))
+            times_ms.append(1e3 * (time.perf_counter() - start))
+            if bench.out_of_time():
+                break
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    made = len(times_ms)
+    tenth = max(1, made // 10)
+    start, end = spread_of(times_ms[:tenth]), spread_of(times_ms[-tenth:])
+    bench.baselines["endurance"] = [Baseline("their first 10 %", start)]
+    flags = hio.Flag(int(state.report.flags))
+    cut = f"stopped by --minutes, of {count:,}; " if made < count else ""
+    note = f"{cut}flags: {flags.name or 'none'}"
+    rows = [
+        Row(f"{made:,} updates in a row, light, all", "ms", spread_of(times_ms), note=note),
+        Row(f"{made:,} updates in a row, light, last 10 %", "ms", end, "endurance"),
+        Row("compilations during these", "", single(len(compilations))),
+    ]
+    for name, value in memory().items():
+        if np.isfinite(value):
+            key = f"{name} before"
+            bench.baselines[key] = [Baseline(key, single(1e-6 * before[name]))]
+            rows.append(Row(f"{name}, bytes after these", "MB", single(1e-6 * value), key))
+    return rows
+
+
+def _map_frames(
+    bench: Bench, config: hio.Config, count: int
+) -> tuple[MapState, list[float], float]:
+    """Maps the warm-up and `count` frames: the map, ms of each of these, s of compilation."""
+    state = jax.block_until_ready(hio.init(config, jax.random.key(0)))
+    times_ms, warmup = [], max(config.warmup_updates, 1)
+    for k in tqdm(range(warmup + count), desc="mapping", unit="frame", leave=False):
+        cloud, pose = bench.frame(k)
+        start = time.perf_counter()
+        state = jax.block_until_ready(hio.update(state, cloud, pose))
+        times_ms.append(1e3 * (time.perf_counter() - start))
+    return state, times_ms[warmup:], 1e-3 * (times_ms[0] - times_ms[1])
+
+
+def _take_apart(bench: Bench, label: str) -> dict[str, stages.Stage]:
+    state = bench.states[label]
+    cloud, pose = bench.frame(int(state.updates))
+    cloud = mapping._to_capacity(cloud, pose, state.config.max_points)
+    return stages.take_apart(state, jnp.asarray(cloud), jnp.asarray(pose))
+
+
+def _sites(config: hio.Config, grid: Any, sensor_world: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    """The voxels of the distance transform's window that its two searches look for."""
+    horizon = config.horizon_voxels * config.voxel_size
+    shape = geometry.window_shape(config, config.max_range + 2 * horizon + config.voxel_size)
+    start = geometry.window_start(config, shape, sensor_world)
+    hits, passes = (
+        geometry.read_window(array, start, shape).astype(jnp.float32)
+        for array in (grid.hits, grid.passes)
+    )
+    features = surface.is_feature(config, hits, passes)
+    return np.asarray(features), np.asarray(surface.is_doubtful(hits, passes))
+
+
+def _row(bench: Bench, name: str, spread: Spread, work: limits.Work | None, compare: str) -> Row:
+    if work is None:
+        return Row(name, "ms", spread, compare)
+    limit, share = limits.share(bench.limits, work, spread.median)
+    return Row(name, "ms", spread, compare, limit, share)
+
+
+def _points_in(config: hio.Config, count: int) -> jax.Array:
+    """(count, 3) m, uniform in the bounds."""
+    low, high = jnp.asarray(config.bounds, jnp.float32)
+    return low + jax.random.uniform(jax.random.key(0), (count, 3)) * (high - low)
+
+
+def _device_memory() -> dict[str, int]:
+    return jax.devices()[0].memory_stats() or {}
+
+
+@jax.jit
+def _network(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
+    value, pull = jax.vjp(lambda points: served.network_sdf(field, points), points_world)
+    return value, pull(jnp.ones_like(value))[0]
+
+
+@jax.jit
+def _grid(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return lookup.grid_sdf_and_grad(field.config, field.surface, points_world)
