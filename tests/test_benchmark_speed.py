@@ -3,35 +3,31 @@
 import dataclasses
 import json
 import math
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import room_cloud
+from room import BOUNDS, CONFIG, room_cloud
 
 import hiosdf_jax as hio
 from benchmarks.speed import __main__ as command
 from benchmarks.speed import baselines, limits, rows, stages, tasks
+from hiosdf_jax import datasets
 from hiosdf_jax.network import passes, siren, training
 from hiosdf_jax.samples import Samples
 
+# The same map as that of other tests, so that its update is compiled once for them all.
 TINY_CONFIG = {
-    "max_points": 250,
-    "near_samples": 200,
-    "far_samples": 300,
-    "local_points": 10,
-    "local_ray_samples": 4,
-    "hidden_width": 16,
-    "hidden_layers": 1,
-    "batches": 1,
-    "warmup_updates": 0,
-    "distance_horizon": 1.0,
+    field.name: getattr(CONFIG, field.name)
+    for field in dataclasses.fields(CONFIG)
+    if field.name != "bounds"
 }
 TINY = dataclasses.replace(
     tasks.QUICK,
     overrides=TINY_CONFIG,
-    paper_overrides=TINY_CONFIG | {"epochs": 2},
+    paper_overrides={"near_samples": 60, "far_samples": 30, "local_points": 1, "epochs": 2},
     frames=3,
     seconds=0.01,
     processes=1,
@@ -39,11 +35,10 @@ TINY = dataclasses.replace(
     copied=1 << 14,
     queries=300,
     baked_queries=500,
-    cloud_sizes=(250,),
-    map_edges=(2.0,),
+    cloud_sizes=(200, 500),
+    map_edges=(2.0, 4.0),
     endurance=6,
 )
-BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
 @pytest.fixture
@@ -59,7 +54,24 @@ def stream(tmp_path):
 
 
 def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
+    taken_apart = []
+
+    def take_apart(state, cloud, pose):
+        taken_apart.append((state, cloud, pose, stages.take_apart(state, cloud, pose)))
+        return taken_apart[-1][-1]
+
+    def plan(bench):
+        return [(name, task) for name, task in tasks.plan(bench) if "sizes" not in name]
+
+    def import_time(command, **_):
+        return "1.5" if "hiosdf_jax" in command[-1] else "1.0"
+
+    extent = datasets.Extent(BOUNDS, CONFIG.max_range)
     monkeypatch.setattr(command, "QUICK", TINY)
+    monkeypatch.setattr(command, "plan", plan)
+    monkeypatch.setattr(tasks.datasets, "find_bounds", lambda _: extent)
+    monkeypatch.setattr(tasks.subprocess, "check_output", import_time)
+    monkeypatch.setattr(tasks, "stages", types.SimpleNamespace(take_apart=take_apart))
     output = tmp_path / "out" / "speed.json"
     assert command.main(["--quick", "--stream", str(stream), "--output", str(output)]) == 0
     table = capsys.readouterr().out
@@ -76,12 +88,64 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         assert not row["limit"] or row["share"] > 0, row
     assert found["compilations during these"]["spread"]["median"] == 0
     assert found["6 updates in a row, light, all"]["note"] == "flags: none"
-    assert {row["limit"] for row in record["rows"]} == {"", "matrix", "vector", "memory"} or True
+    for name in ("training", "distance", "local samples"):
+        assert found[f"{name}, light"]["limit"]
     for key in {row["compare"] for row in record["rows"]} - {""}:
         for baseline in record["baselines"][key]:
             assert baseline["spread"] or "torch" in baseline["reason"], baseline
-    measured = {key for key, found in record["baselines"].items() if found[0]["spread"]}
+    measured = {key for key, beside in record["baselines"].items() if beside[0]["spread"]}
     assert measured >= {"import", "nearest", "distance", "endurance", "live arrays before"}
+
+    ((state, cloud, pose, parts),) = taken_apart
+    assert_stages_make_the_update(parts, state, hio.update(state, cloud, pose))
+
+
+def assert_stages_make_the_update(parts, state, whole):
+    network, _, _ = parts["training"].result
+    for ours, theirs, before in (
+        (parts["frontier"].result, whole.grid, state.grid),
+        (parts["calibration"].result, whole.optimism, None),
+        (network, whole.network, state.network),
+    ):
+        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+            np.testing.assert_allclose(
+                np.asarray(a, float), np.asarray(b, float), rtol=1e-3, atol=1e-3
+            )
+        if before is not None:
+            pairs = zip(jax.tree.leaves(theirs), jax.tree.leaves(before), strict=True)
+            assert max(np.abs(np.asarray(a, float) - np.asarray(b)).max() for a, b in pairs) > 0.01
+
+
+def test_sizes_of_clouds_and_maps(monkeypatch):
+    """With an update that does nothing: what it is given is what the rows are about."""
+    given = []
+
+    def update(state, cloud, pose):
+        given.append((state.config, len(cloud)))
+        return state
+
+    monkeypatch.setattr(tasks.hio, "update", update)
+    extent = datasets.Extent(BOUNDS, CONFIG.max_range)
+    bench = tasks.Bench(TINY, [room_cloud(0)], extent, deadline=math.inf)
+    found = tasks.cloud_size_rows(bench)
+    assert [row.name for row in found] == [
+        "update, light, 200 points, 300 used",
+        "update, light, 200 points, all used",
+        "update, light, 500 points, 300 used",
+        "update, light, 500 points, all used",
+    ]
+    assert {(config.max_points, count) for config, count in given} == {
+        (300, 200),
+        (200, 200),
+        (300, 500),
+        (500, 500),
+    }
+    given.clear()
+    found = tasks.map_size_rows(bench)
+    assert [row.note for row in found] == ["20x20x16 voxels", "40x40x16 voxels"]
+    assert [row.compare for row in found] == ["", "map size"]
+    assert bench.baselines["map size"][0].spread == found[0].spread
+    assert {config.grid_shape for config, _ in given} == {(20, 20, 16), (40, 40, 16)}
 
 
 def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):
@@ -97,25 +161,6 @@ def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkey
     assert "1.50" in table
     assert command.main([*arguments, "--minutes", "0"]) == 0
     assert "not run" in capsys.readouterr().out
-
-
-def test_the_stages_make_the_update():
-    config = hio.Config.light(BOUNDS, **TINY_CONFIG)
-    state = hio.update(hio.init(config, jax.random.key(0)), *room_cloud(0))
-    cloud, pose = room_cloud(1)
-    parts = stages.take_apart(state, jnp.asarray(cloud), jnp.asarray(pose))
-    whole = hio.update(state, cloud, pose)
-    network, _, _ = parts["training"].result
-    for ours, theirs in (
-        (parts["frontier"].result, whole.grid),
-        (parts["calibration"].result, whole.optimism),
-        (network, whole.network),
-    ):
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-            np.testing.assert_allclose(
-                np.asarray(a, float), np.asarray(b, float), rtol=1e-3, atol=1e-4
-            )
-    assert np.abs(np.asarray(whole.grid.passes) - np.asarray(state.grid.passes)).max() > 0
 
 
 def test_work_is_what_xla_counts():
