@@ -15,7 +15,7 @@ import jax
 from tqdm import tqdm
 
 from benchmarks.speed.rows import Row, format_table
-from benchmarks.speed.tasks import FULL, QUICK, Bench, Task, open_bench, plan
+from benchmarks.speed.tasks import FULL, OUT_OF_TIME, QUICK, Bench, Task, open_bench, plan
 from hiosdf_jax import datasets
 from hiosdf_jax.run import to_json
 
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(bench: Bench, name: str, task: Task) -> list[Row]:
     """Runs a task; one that fails gives a row that says why."""
     if bench.out_of_time():
-        return [Row(name, note="not run: --minutes are over")]
+        return [Row(name, note=OUT_OF_TIME)]
     try:
         return task()
     except Exception as error:

@@ -102,8 +102,11 @@ def time_ms(
 
 
 def format_table(rows: Sequence[Row], baselines: Baselines) -> str:
-    """Lays rows out for a terminal, each with its baselines under one another."""
-    cells = [["", "unit", "median", "p10", "p90", "p99", "limit", "share", "baseline", "", "ratio"]]
+    """Lays rows out for a terminal, each with its baselines under one another.
+
+    The last column is the row's median as a multiple of the baseline's.
+    """
+    cells = [["", "unit", "median", "p10", "p90", "p99", "limit", "share", "baseline", "", "of it"]]
     notes = []
     for row in rows:
         name = row.name
@@ -141,11 +144,11 @@ def _align(cells: list[list[str]]) -> str:
 
 
 def _compare(spread: Spread | None, baseline: Baseline) -> tuple[str, str, str]:
-    """Name, median, and how many times as long the baseline takes."""
+    """Name and median of a baseline, and the row's median as a multiple of it."""
     if baseline.spread is None:
         return f"{baseline.name}: {baseline.reason}", "none", ""
-    ratio = "" if spread is None else _number(baseline.spread.median / spread.median)
-    return baseline.name, _number(baseline.spread.median), ratio
+    multiple = "" if spread is None else _number(spread.median / baseline.spread.median)
+    return baseline.name, _number(baseline.spread.median), multiple
 
 
 def _number(value: float) -> str:
