@@ -183,7 +183,7 @@ def test_work_is_what_xla_counts():
     once = limits.training_work(config).matrix - limits.network_query_work(config, 600).matrix / 2
     assert once == pytest.approx(operations(gradient, network.params), rel=0.05)
     asked = operations(lambda p: passes.value_and_gradient(10.0, p, points), network.params)
-    assert limits.network_query_work(config, 600).matrix == pytest.approx(asked, rel=0.05)
+    assert limits.network_query_work(config, 600).matrix == pytest.approx(asked, rel=0.1)
 
 
 def test_a_row_stands_beside_its_baselines():
