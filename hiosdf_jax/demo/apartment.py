@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from hiosdf_jax.demo.camera import DepthCamera
 from hiosdf_jax.demo.primitives import signed_distance
 from hiosdf_jax.evaluation import GroundTruth, choose_thin
 
@@ -63,11 +64,6 @@ _WAYPOINTS = np.array(
         (3.50, 3.60, 0),
     ]
 )
-
-_MIN_RANGE = 0.3  # m, a depth camera is blind nearer than that
-_DROP_OUT = 0.005  # share of the pixels that see nothing for no reason
-_FLYING = 0.15  # share of the pixels at a depth edge that mix foreground and background
-_EDGE = 0.1  # step of depth between neighbours, relative to the nearer one, that makes an edge
 
 
 def load_model() -> mujoco.MjModel:
@@ -149,23 +145,11 @@ class ApartmentStream:
         Raises:
           ValueError: frames, width or height < 1, or max_range <= 0.3.
         """
-        if width < 1 or height < 1:
-            raise ValueError(f"width, height = {width}, {height}, expected >= 1")
-        if not max_range > _MIN_RANGE:
-            raise ValueError(f"max_range = {max_range}, expected > {_MIN_RANGE}")
         self.model = load_model()
         self.poses_world_sensor = camera_path(frames)
+        self.camera = DepthCamera(self.model, width, height, max_range, noise)
         self.height, self.width = height, width
         self.max_range, self.seed, self.noise = max_range, seed, noise
-        self._data = mujoco.MjData(self.model)
-        mujoco.mj_forward(self.model, self._data)
-        # The ray through the middle of every pixel, with a depth (z) of 1.
-        focal = width / 2  # pixels: half the width spans 45 degrees
-        u = (np.arange(width) + 0.5 - width / 2) / focal
-        v = (np.arange(height) + 0.5 - height / 2) / focal
-        x, y = np.meshgrid(u, v)
-        self._rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-        self._lengths = np.linalg.norm(self._rays, axis=1)
 
     def __len__(self) -> int:
         """The number of frames."""
@@ -185,12 +169,8 @@ class ApartmentStream:
         Raises:
           IndexError: the index is out of range.
         """
-        depth = self.exact_depth(index)
-        if self.noise:
-            depth = _add_noise(depth.reshape(self.height, self.width), (self.seed, index)).ravel()
-        depth = np.where(self._in_range(depth), depth, np.nan)
-        cloud = depth[:, None] * self._rays
-        return cloud.astype(np.float32), self.poses_world_sensor[index].astype(np.float32)
+        pose = self._pose(index)
+        return self.camera.cloud(pose, (self.seed, index)), pose.astype(np.float32)
 
     def exact_depth(self, index: int) -> np.ndarray:
         """Casts the rays of a frame, with neither noise nor a limit of range.
@@ -205,31 +185,7 @@ class ApartmentStream:
         Raises:
           IndexError: the index is out of range.
         """
-        return self._cast(index)[0]
-
-    def _cast(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Depths (height * width,), and the geoms that the rays met."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"index = {index}, expected 0 <= index < {len(self)}")
-        pose = self.poses_world_sensor[index]
-        directions = (self._rays / self._lengths[:, None]) @ pose[:3, :3].T
-        count = len(directions)
-        ranges, geoms = np.empty(count), np.empty(count, np.int32)
-        mujoco.mj_multiRay(
-            m=self.model,
-            d=self._data,
-            pnt=pose[:3, 3],
-            vec=directions.ravel(),
-            geomgroup=None,  # every group
-            flg_static=True,  # static geoms, which all of these are, count
-            bodyexclude=-1,
-            geomid=geoms,
-            dist=ranges,
-            normal=None,
-            nray=count,
-            cutoff=mujoco.mjMAXVAL,
-        )
-        return ranges / self._lengths, geoms
+        return self.camera.exact_depth(self._pose(index))
 
     def exact_surface(self, index: int) -> np.ndarray:
         """Finds the surface points that a frame sees within the camera's limits of range.
@@ -258,15 +214,12 @@ class ApartmentStream:
         Raises:
           IndexError: the index is out of range.
         """
-        depth, geom = self._cast(index)
-        seen = self._in_range(depth)
-        pose = self.poses_world_sensor[index]
-        points = depth[seen, None] * self._rays[seen] @ pose[:3, :3].T + pose[:3, 3]
-        return points, geom[seen]
+        return self.camera.exact_parts(self._pose(index))
 
-    def _in_range(self, depth: np.ndarray) -> np.ndarray:
-        ranges = depth * self._lengths
-        return (ranges >= _MIN_RANGE) & (ranges <= self.max_range)
+    def _pose(self, index: int) -> np.ndarray:
+        if not 0 <= index < len(self):
+            raise IndexError(f"index = {index}, expected 0 <= index < {len(self)}")
+        return self.poses_world_sensor[index]
 
 
 def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> GroundTruth:
@@ -316,24 +269,3 @@ def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> 
         surface_points_world=np.concatenate(surface).astype(np.float32),
         thin_points_world=np.concatenate(thin)[chosen].astype(np.float32),
     )
-
-
-def _add_noise(depth: np.ndarray, seed: tuple[int, int]) -> np.ndarray:
-    """What a structured-light camera makes of exact depths (H, W), metres; NaN where it drops out.
-
-    The noise is that of the Kinect (Nguyen, Izadi, Lovell: Modeling Kinect Sensor Noise for
-    Improved 3D Reconstruction and Tracking, 3DIMPVT 2012).
-    """
-    rng = np.random.default_rng(seed)
-    height, width = depth.shape
-    # A pixel flies where it averages over an edge: somewhere between itself and a neighbour.
-    down, right = rng.integers(-1, 2, size=(2, height, width))
-    row, column = np.indices(depth.shape)
-    neighbour = depth[np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
-    at_edge = np.abs(neighbour - depth) > _EDGE * np.minimum(depth, neighbour)
-    flies = at_edge & (rng.uniform(size=depth.shape) < _FLYING)
-    mixed = depth + rng.uniform(size=depth.shape) * (neighbour - depth)
-    depth = np.where(flies, mixed, depth)
-
-    depth = depth + (0.0012 + 0.0019 * (depth - 0.4) ** 2) * rng.normal(size=depth.shape)
-    return np.where(rng.uniform(size=depth.shape) < _DROP_OUT, np.nan, depth)
