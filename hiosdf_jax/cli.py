@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from hiosdf_jax.datasets import Stream
     from hiosdf_jax.evaluation import GroundTruth
 
-_NOTHING_MAPPED, _BAD_INPUT = 1, 2  # exit codes; argparse itself exits with 2
+_NOTHING_MAPPED, _NOT_REACHED, _BAD_INPUT = 1, 1, 2  # exit codes; argparse itself exits with 2
+_OUTPUT = Path("hiosdf_output")
+_DEMO_FRAMES = 80
 _SKIP_HINT = " (--skip-bad-frames goes on without such frames)"
 
 
@@ -52,8 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Those after the command's name; by default those of the process.
 
     Returns:
-        The exit code: 0, 1 if no frame could be mapped, 2 if a file, a frame or a value is not
-        what it should be.
+        The exit code: 0, 1 if no frame could be mapped or the robot did not come to its goal, 2 if
+        a file, a frame or a value is not what it should be.
 
     Raises:
         SystemExit: An argument is unknown or malformed, or help was asked for.
@@ -70,18 +72,56 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _demo(options: argparse.Namespace) -> None:
     from hiosdf_jax import demo
 
-    stream = demo.ApartmentStream(frames=options.frames, seed=options.seed)
+    if options.plan:
+        _plan(options)
+        return
+    frames = options.frames or _DEMO_FRAMES
+    stream = demo.ApartmentStream(frames=frames, seed=options.seed)
     config = _configure(options.config, demo.BOUNDS_WORLD, max_range=stream.max_range)
     print(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
     _run(
         stream,
         config,
-        options.output,
+        options.output or _OUTPUT / "demo",
         name="demo",
         seed=options.seed,
         truth=demo.ground_truth(stream),
         exact_sdf=lambda points_world: demo.signed_distance(stream.model, points_world)[0],
     )
+
+
+def _plan(options: argparse.Namespace) -> None:
+    for name in ("frames", "config"):
+        if getattr(options, name) is not None:
+            raise _Failure(f"--{name} is not of --plan, which has its own", _BAD_INPUT)
+    try:
+        from hiosdf_jax.demo import explore, picture
+    except ModuleNotFoundError as error:
+        if error.name != "jax_mppi":
+            raise
+        hint = "--plan needs jax-mppi: pip install 'hiosdf_jax[plan]'"
+        raise _Failure(hint, _BAD_INPUT) from error
+
+    output = options.output or _OUTPUT / "demo_plan"
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        print("a robot looks for its way through an apartment that it does not know")
+        run = explore.explore(options.seed)
+        print("drawing plan.png and plan.gif")
+        picture.write_run(output, run)
+    except OSError as error:
+        raise _Failure(_told(error), _BAD_INPUT) from error
+    told = run.metrics
+    print(
+        f"from the {told['from']} to the {told['to']}: {told['path_m']:.1f} m in "
+        f"{told['robot_s']:.0f} s, {told['updates']} updates of the map, "
+        f"least clearance {100 * told['least_clearance_m']:.1f} cm"
+    )
+    print(f"wrote {output}{os.sep} (the run took {told['wall_s']:.0f} s)")
+    if told["collided"]:
+        raise _Failure("the robot collided", _NOT_REACHED)
+    if not told["reached"]:
+        raise _Failure("the robot did not come to its goal", _NOT_REACHED)
 
 
 def _map(options: argparse.Namespace) -> None:
@@ -123,7 +163,7 @@ def _map(options: argparse.Namespace) -> None:
     _run(
         stream,
         _configure(options.config, bounds, **overrides),
-        options.output or Path("hiosdf_output") / (place.name if place.is_dir() else place.stem),
+        options.output or _OUTPUT / (place.name if place.is_dir() else place.stem),
         name=place.name,
         seed=options.seed,
         truth=truth,
@@ -145,10 +185,10 @@ def _ground_truth(
     return truth, scene.sdf_to_draw
 
 
-def _configure(name: str, bounds: Any, **overrides: float) -> Config:
+def _configure(name: str | None, bounds: Any, **overrides: float) -> Config:
     from hiosdf_jax.config import Config
 
-    return _checked(lambda: getattr(Config, name)(bounds, **overrides))
+    return _checked(lambda: getattr(Config, name or "light")(bounds, **overrides))
 
 
 def _run(stream: Stream, config: Config, output: Path, **settings: Any) -> None:
@@ -191,8 +231,8 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument(
         "--config",
         choices=("light", "paper", "default"),
-        default="light",
-        help="light is sized for a CPU, default for a GPU, paper has the paper's numbers",
+        help="light, the one you get without this, is sized for a CPU, default for a GPU, paper "
+        "has the paper's numbers",
     )
     common.add_argument(
         "--seed", type=_whole(0), default=0, help="of all randomness (default: %(default)s)"
@@ -203,21 +243,25 @@ def _parser() -> argparse.ArgumentParser:
         parents=[common],
         help="map a simulated apartment and score the map",
         description="Maps a simulated, furnished apartment, scores the map against exact "
-        "distances, and draws it.",
+        "distances, and draws it; or, with --plan, lets a robot explore it.",
     )
     demo.add_argument(
         "--output",
         type=Path,
-        default=Path("hiosdf_output") / "demo",
         metavar="DIR",
-        help="folder for metrics and pictures (default: %(default)s)",
+        help="folder for metrics and pictures (default: hiosdf_output/demo, or demo_plan)",
     )
     demo.add_argument(
         "--frames",
         type=_whole(1),
-        default=80,
         metavar="N",
-        help="frames along the camera's path (default: %(default)s)",
+        help=f"frames along the camera's path (default: {_DEMO_FRAMES})",
+    )
+    demo.add_argument(
+        "--plan",
+        action="store_true",
+        help="instead, let a robot find its way to another room on nothing but its own map; needs "
+        "jax-mppi. --seed chooses start and goal as well",
     )
     demo.set_defaults(command=_demo)
 
