@@ -177,7 +177,7 @@ def summarise(runs: list[dict]) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="See the top of the file.")
+    parser = argparse.ArgumentParser(description="Blind corner.")
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()

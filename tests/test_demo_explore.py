@@ -48,11 +48,11 @@ def test_problems_are_solvable_and_not_trivial(model):
 
 
 def test_the_camera_looks_ahead_and_down_from_the_front_of_the_body():
-    pose = explore.camera_pose(np.array([2.0, 3.0, np.pi / 2, 0, 0]))
+    tilt = np.radians(25)
+    pose = explore.camera_pose(np.array([2.0, 3.0, np.pi / 2, 0, 0]), tilt)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
     np.testing.assert_allclose(pose[:3, 3], [2.0, 3.2, 1.1])
-    tilt = np.radians(25)
     np.testing.assert_allclose(pose[:3, 2], [0, np.cos(tilt), -np.sin(tilt)], atol=1e-12)
     np.testing.assert_allclose(pose[:3, 0], [1, 0, 0], atol=1e-12)  # right, looking north: east
 

@@ -36,8 +36,10 @@ _ROOMS = {  # inner faces, ((x0, y0), (x1, y1)) m
 _ROOM_TO_PASS = 0.1  # m of clearance on a way that there must be
 _ROOM_TO_START = 0.15  # m more around a robot that is put down, and around its goal
 
-# The camera looks out of the body's front, upright (portrait), over the floor just ahead.
-_CAMERA_AHEAD, _CAMERA_HEIGHT, _CAMERA_PITCH = 0.2, 1.1, np.radians(25)
+# The camera looks out of the body's front, upright (portrait), over the floor just ahead; when the
+# robot looks around it nods, since what is overhead nearby is not seen from there otherwise.
+_CAMERA_AHEAD, _CAMERA_HEIGHT = 0.2, 1.1
+_PITCH_DRIVING, _PITCHES_LOOKING = np.radians(25), np.radians([25, -15])  # downwards
 _WIDTH, _HEIGHT, _MAX_RANGE = 108, 144, 5.0
 _MAP_TOP = 2.0  # m; nothing higher matters to the robot
 _CELL = 0.1  # m, of the geodesic's plane
@@ -152,18 +154,19 @@ def exact_clearance(model: Any, xy: np.ndarray, samples: int = 16) -> np.ndarray
     return signed_distance(model, points)[0].reshape(len(xy), -1).min(axis=1) - ROBOT.radius
 
 
-def camera_pose(state: np.ndarray) -> np.ndarray:
+def camera_pose(state: np.ndarray, pitch: float) -> np.ndarray:
     """Where the camera is when the robot is in a state.
 
     Args:
         state: (5,), or its first three: x, y (m), yaw (rad).
+        pitch: How far it looks below the horizon, rad.
 
     Returns:
         (4, 4) T_world_sensor, optical frame (x right, y down, z forward).
     """
     x, y, yaw = np.asarray(state[:3], float)
     cos, sin = np.cos(yaw), np.sin(yaw)
-    forward = np.array([cos, sin, -np.tan(_CAMERA_PITCH)]) * np.cos(_CAMERA_PITCH)
+    forward = np.array([cos, sin, -np.tan(pitch)]) * np.cos(pitch)
     right = np.array([sin, -cos, 0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
@@ -219,7 +222,8 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
         xy = np.asarray(state[:2], float)
         if k % (_SENSE_EVERY_TURNING if spinning else _SENSE_EVERY) == 0:
             start = time.perf_counter()
-            pose = camera_pose(np.asarray(state))
+            pitch = _PITCHES_LOOKING[len(moments) % 2] if spinning else _PITCH_DRIVING
+            pose = camera_pose(np.asarray(state), float(pitch))
             map_state = mapping.update(map_state, camera.cloud(pose, (seed, k)), pose)
             field = mapping.snapshot(map_state, k * ROBOT.step)
             task, path_from, cells = navigate.make_task(ROBOT, field, plane, problem.goal, barred)
@@ -258,9 +262,10 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
             spinning, turned = True, 0.0
 
     clearances.append(float(_clearance(ROBOT, field, state, unknown)))
-    exact = exact_clearance(model, np.concatenate([problem.start[None, :2], *passed]))
-    exact = np.concatenate([exact[:1], exact[1:].reshape(len(passed), -1).min(axis=1)])
     path = np.concatenate([problem.start[None, :2], *passed])
+    exact = exact_clearance(model, path)
+    exact = np.concatenate([exact[:1], exact[1:].reshape(len(passed), -1).min(axis=1)])
+    first_drive = next((moment for moment in moments if not moment.spinning), moments[-1])
     metrics = {
         "seed": seed,
         "unknown": unknown,
@@ -268,6 +273,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
         "to": problem.rooms[1],
         "start": problem.start.tolist(),
         "goal": problem.goal.tolist(),
+        "goal_seen_from_start": bool(first_drive.cells.seen[plane.cell(problem.goal)]),
         "reached": reached,
         "collided": bool(exact.min() < 0),
         "least_clearance_m": float(exact.min()),

@@ -28,7 +28,7 @@ _SUBSTEPS = 4  # of a control step, in motion and in the guard's look ahead
 _ROUNDING = 1e-5  # m, of a distance
 
 # Costs a control step; jax-mppi's own cost of the noise is about one a step.
-_PER_METRE_TO_GO = 20.0
+_PER_METRE_TO_GO = 30.0
 _PER_METRE_NEAR = 100.0
 _PER_METRE_TOO_NEAR = 3000.0
 _FACING_AWAY = 8.0
