@@ -78,3 +78,40 @@ def test_options_of_the_mapping_demo_do_not_go_with_plan(tmp_path, capsys):
         assert cli.main(arguments) == 2
         assert option[0] in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def still(x, turn_rate=0.0):
+    return np.array([x, 0.0, 0.0, 0.0, turn_rate])
+
+
+def steps_until(condition, watch, state):
+    for count in range(1, 1000):
+        vain = watch.looked_in_vain(state)
+        if condition(watch):
+            return count * explore.ROBOT.step, vain
+    raise AssertionError("never")
+
+
+def test_a_robot_that_is_stuck_looks_around_and_the_second_time_gives_up():
+    watch = explore._Watch(np.zeros(2))
+    assert watch.turning
+    turn = steps_until(lambda w: not w.turning, watch, still(0, 1.5))
+    assert turn == (pytest.approx(2 * np.pi / 1.5, abs=explore.ROBOT.step), False)
+    for x in np.linspace(0, 2, 100):  # slow, but it gets on
+        assert not watch.looked_in_vain(still(x)) and not watch.turning
+    seconds, vain = steps_until(lambda w: w.turning, watch, still(2))
+    assert seconds == pytest.approx(5, abs=2) and not vain
+    steps_until(lambda w: not w.turning, watch, still(2, -1.5))
+    assert steps_until(lambda w: w.turning, watch, still(2.1))[1]
+    assert len(watch.places) == 3
+
+
+def test_the_way_that_is_given_up_is_what_was_not_seen_just_ahead():
+    plane = navigate.lay_plane(((0, 0, 0), (3, 1, 1)), 0.1)
+    x = plane.centres()[..., 0]
+    cells = navigate.Survey(gap=np.ones(plane.shape), seen=x < 1.0)
+    path = np.column_stack([np.arange(0.55, 2.6, 0.07), np.full(30, 0.55)])
+    barred = explore._bar(plane, path, cells)
+    # From the first unseen cell, and one cell around, to a metre ahead.
+    np.testing.assert_array_equal(barred[:, 5], (x[:, 0] > 0.9) & (x[:, 0] < 1.7))
+    assert not barred[:, :4].any() and not barred[:, 7:].any()

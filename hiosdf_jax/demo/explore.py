@@ -72,14 +72,14 @@ class Moment(NamedTuple):
         cells: What the map said of the plane.
         path: The way that it meant to go, (P, 2) m.
         rollouts: Of MPPI, (K, T, 2) m.
-        spinning: Whether it turned on the spot to look around.
+        turning: Whether it turned on the spot to look around.
     """
 
     step: int
     cells: navigate.Survey
     path: np.ndarray
     rollouts: np.ndarray
-    spinning: bool
+    turning: bool
 
 
 class Run(NamedTuple):
@@ -211,30 +211,29 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
     map_state = _put_down(mapping.init(map_config(), key), problem.start)
 
     state, plan = jnp.array([*problem.start, 0.0, 0.0], jnp.float32), driver.plan
+    watch = _Watch(problem.start[:2])
     barred = np.zeros(plane.shape, bool)
     states, passed, clearances, moments = [np.asarray(state)], [], [], []
     update_seconds, step_seconds, refusals = [], [], 0
-    turned, spinning, spins = 0.0, True, []
-    anchor, anchor_step = problem.start[:2], 0
     task = path_from = field = None
     reached, steps = False, int(_TIME_LIMIT / ROBOT.step)
     for k in range(steps):
         xy = np.asarray(state[:2], float)
-        if k % (_SENSE_EVERY_TURNING if spinning else _SENSE_EVERY) == 0:
+        if k % (_SENSE_EVERY_TURNING if watch.turning else _SENSE_EVERY) == 0:
             start = time.perf_counter()
-            pitch = _PITCHES_LOOKING[len(moments) % 2] if spinning else _PITCH_DRIVING
+            pitch = _PITCHES_LOOKING[len(moments) % 2] if watch.turning else _PITCH_DRIVING
             pose = camera_pose(np.asarray(state), float(pitch))
             map_state = mapping.update(map_state, camera.cloud(pose, (seed, k)), pose)
             field = mapping.snapshot(map_state, k * ROBOT.step)
             task, path_from, cells = navigate.make_task(ROBOT, field, plane, problem.goal, barred)
             update_seconds.append(time.perf_counter() - start)
             rollouts = np.asarray(driver.rollouts(plan, state))[..., :2]
-            moments.append(Moment(k, cells, path_from(xy), rollouts, spinning))
+            moments.append(Moment(k, cells, path_from(xy), rollouts, watch.turning))
         assert task is not None and path_from is not None and field is not None
         clearances.append(float(_clearance(ROBOT, field, state, unknown)))
 
         start = time.perf_counter()
-        if spinning:
+        if watch.turning:
             control = _turn_on_the_spot(np.asarray(state))
         else:
             task = navigate.head(task, path_from, xy)
@@ -245,27 +244,18 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
         state = jnp.asarray(moved[-1])
         states.append(moved[-1])
         passed.append(moved[:, :2])
-        if np.linalg.norm(moved[-1, :2] - problem.goal) < REACHED:
-            reached = True
+        reached = bool(np.linalg.norm(moved[-1, :2] - problem.goal) < REACHED)
+        if reached:
             break
+        if watch.looked_in_vain(moved[-1]):
+            barred |= _bar(plane, path_from(moved[-1, :2]), moments[-1].cells)
 
-        turned += abs(float(moved[-1, 4])) * ROBOT.step * spinning
-        if spinning and turned > 2 * np.pi:
-            spinning, anchor, anchor_step = False, moved[-1, :2], k
-        elif not spinning and np.linalg.norm(moved[-1, :2] - anchor) > _STUCK_WITHIN:
-            anchor, anchor_step = moved[-1, :2], k
-        elif not spinning and (k - anchor_step) * ROBOT.step > _STUCK_AFTER:
-            # Look around; if that has been done here, what lies ahead will never be seen.
-            if any(np.linalg.norm(place - moved[-1, :2]) < 2 * _STUCK_WITHIN for place in spins):
-                barred |= _bar(plane, path_from(moved[-1, :2]), moments[-1].cells)
-            spins.append(moved[-1, :2])
-            spinning, turned = True, 0.0
-
+    assert field is not None
     clearances.append(float(_clearance(ROBOT, field, state, unknown)))
     path = np.concatenate([problem.start[None, :2], *passed])
     exact = exact_clearance(model, path)
     exact = np.concatenate([exact[:1], exact[1:].reshape(len(passed), -1).min(axis=1)])
-    first_drive = next((moment for moment in moments if not moment.spinning), moments[-1])
+    first_drive = next((moment for moment in moments if not moment.turning), moments[-1])
     metrics = {
         "seed": seed,
         "unknown": unknown,
@@ -280,7 +270,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
         "robot_s": len(passed) * ROBOT.step,
         "path_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         "updates": len(update_seconds),
-        "looks_around": 1 + len(spins),
+        "looks_around": len(watch.places),
         "cells_barred": int(barred.sum()),
         "steps_refused": refusals,
         "sense_and_update_median_ms": 1000 * float(np.median(update_seconds)),
@@ -288,10 +278,36 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
         "wall_s": time.perf_counter() - begin,
         "device": jax.devices()[0].device_kind,
     }
-    assert field is not None
     return Run(
         problem, np.array(states), np.array(clearances), exact, moments, plane, field, metrics
     )
+
+
+class _Watch:
+    """Decides when to look around: at the start, and after a while without getting anywhere."""
+
+    def __init__(self, xy: np.ndarray) -> None:
+        self.turning, self.places = True, [xy]
+        self._turned = 0.0  # rad
+        self._anchor, self._seconds = xy, 0.0  # it has been near there for so long
+
+    def looked_in_vain(self, state: np.ndarray) -> bool:
+        """Takes note of a control step; whether it is stuck where it has looked around before."""
+        xy = state[:2]
+        if self.turning:
+            self._turned += abs(float(state[4])) * ROBOT.step
+            self.turning = self._turned < 2 * np.pi
+            self._anchor, self._seconds = xy, 0.0
+            return False
+        self._seconds += ROBOT.step
+        if np.linalg.norm(xy - self._anchor) > _STUCK_WITHIN:
+            self._anchor, self._seconds = xy, 0.0
+        if self._seconds < _STUCK_AFTER:
+            return False
+        again = any(np.linalg.norm(place - xy) < 2 * _STUCK_WITHIN for place in self.places)
+        self.turning, self._turned = True, 0.0
+        self.places.append(xy)
+        return again
 
 
 def _put_down(state: Any, start: np.ndarray) -> Any:

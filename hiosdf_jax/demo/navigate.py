@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax_mppi
+import jax_mppi  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 from hiosdf_jax.planning import mppi

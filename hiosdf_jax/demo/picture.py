@@ -15,7 +15,7 @@ from hiosdf_jax.demo.explore import ROBOT, Moment, Run
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_LIMIT = ROBOT.heights[0]  # m, end of the colours: the floor is never farther
+_LIMIT = 0.6  # m, end of the colours
 _GIF_FRAMES = 60
 _GIF_INCHES, _GIF_DPI = (7.0, 5.9), 80
 _GIF_FRAME_MS, _GIF_LAST_MS = 150, 2500
@@ -47,7 +47,7 @@ def save_picture(path: str | os.PathLike[str], run: Run) -> None:
 
     figure = Figure(figsize=(17, 8.6), layout="constrained")
     rows: Any = figure.subfigures(2, 1, height_ratios=(1.75, 1))
-    driving = [moment for moment in run.moments if not moment.spinning] or run.moments
+    driving = [moment for moment in run.moments if not moment.turning] or run.moments
     shown = [driving[0], driving[len(driving) // 2], run.moments[-1]]
     panels = rows[0].subplots(1, len(shown), sharey=True)
     titles = ("after looking around", "half-way", "in the end")
@@ -60,8 +60,8 @@ def save_picture(path: str | os.PathLike[str], run: Run) -> None:
         image, ax=list(panels), label="distance of the body's axis [m]", shrink=0.9, extend="both"
     )
     rows[0].supxlabel(
-        "grey: not seen; black: surfaces in the map; green: driven; magenta: the way it means to "
-        "go, unseen space taken for free; orange: rollouts; star: goal",
+        "grey: not seen; dull: not seen at all heights of the body; black: surfaces in the map; "
+        "green: driven; magenta: the way it means to go; orange: rollouts; star: goal",
         fontsize=10,
     )
     _draw_clearance(rows[1].subplots(), run)
@@ -83,11 +83,12 @@ def save_animation(path: str | os.PathLike[str], run: Run) -> None:
     moments = run.moments[::every]
     if moments[-1] is not run.moments[-1]:
         moments.append(run.moments[-1])
+    figure = Figure(figsize=_GIF_INCHES, dpi=_GIF_DPI)
+    canvas = FigureCanvasAgg(figure)
     frames = []
     for moment in moments:
-        figure = Figure(figsize=_GIF_INCHES, dpi=_GIF_DPI, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
-        ax = figure.subplots()
+        figure.clear()
+        ax = figure.add_axes((0.05, 0.04, 0.93, 0.91))
         _draw_moment(ax, run, moment)
         ax.set_title(
             f"{moment.step * ROBOT.step:5.1f} s, clearance in the map "
@@ -96,8 +97,9 @@ def save_animation(path: str | os.PathLike[str], run: Run) -> None:
             fontsize=10,
         )
         canvas.draw()
-        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
-        frames.append(Image.fromarray(pixels).quantize(64))
+        pixels = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+        # An octree keeps the few pixels of the goal and the way red; a median cut does not.
+        frames.append(pixels.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
     durations = [_GIF_FRAME_MS] * (len(frames) - 1) + [_GIF_LAST_MS]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
@@ -141,7 +143,7 @@ def _draw_clearance(ax: Axes, run: Run) -> None:
     ax.plot(seconds, 100 * run.clearance, color="tab:blue", linewidth=1, label=label)
     ax.axhline(100 * ROBOT.margin, color="tab:orange", linestyle="--", label="the guard's margin")
     ax.axhline(0, color="tab:red", label="collision")
-    stops = [moment.step for moment in run.moments if moment.spinning]
+    stops = [moment.step for moment in run.moments if moment.turning]
     for step in stops:
         ax.axvspan(*(ROBOT.step * np.array([step, step + 2])), color="0.9", linewidth=0, zorder=0)
     floor_cm = 100 * (ROBOT.heights[0] - ROBOT.radius)

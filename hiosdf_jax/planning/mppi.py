@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax_mppi
+import jax_mppi  # pyright: ignore[reportMissingImports]
 
 Controller = Callable[[jax_mppi.MPPIState, Any, Any], tuple[jax.Array, jax_mppi.MPPIState]]
 
