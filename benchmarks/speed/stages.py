@@ -61,7 +61,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
 
     def fade(grid: Any, sensor_world: jax.Array) -> Any:
         grid = rays.fade_evidence(config, grid, sensor_world)
-        return mapping._with_evidence_as(grid, mapping._STORED)
+        return mapping._narrow(grid)
 
     def train(network: Any, samples: Any, epochs: Any, average: Any, key: jax.Array) -> Any:
         return training.train(config, network, samples, epochs, average, key)
@@ -75,7 +75,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         sensor_world,
         check_key,
     )
-    grid = mapping._with_evidence_as(state.grid, jnp.float32)
+    grid = mapping._widen(state.grid)
     grid = stage(
         "fusion",
         lambda *arguments: surface.fuse_hits(config, *arguments),
