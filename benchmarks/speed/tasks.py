@@ -468,7 +468,8 @@ def _sites(config: hio.Config, grid: Any, sensor_world: jax.Array) -> tuple[np.n
         geometry.read_window(array, start, shape).astype(jnp.float32)
         for array in (grid.hits, grid.passes)
     )
-    features = surface.is_feature(config, hits, passes)
+    axes = geometry.read_window(grid.surface.axes, start, shape)
+    features = surface.is_feature(config, hits, passes, axes)
     return np.asarray(features), np.asarray(surface.is_doubtful(hits, passes))
 
 
