@@ -247,7 +247,7 @@ def _empty_grid(config: Config) -> Grid:
             nearest=jnp.full((*shape, 3), distance.NO_FEATURE, jnp.int8),
             sdf=jnp.full(shape, config.distance_horizon, _STORED),
             doubt=jnp.full(shape, config.distance_horizon, _STORED),
-            frontier=jnp.full(shape, -config.frontier_horizon, _STORED),
+            frontier=jnp.full(shape, -geometry.FRONTIER_STEPS, jnp.int8),
         ),
     )
 

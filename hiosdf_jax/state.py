@@ -62,9 +62,9 @@ class Surface(flax.struct.PyTreeNode):
         doubt: Distance of the voxel's centre to the nearest voxel in which any ray has ended and
             that is not all but certainly free: surfaces that were carved or met once are among
             them, m, (X, Y, Z) float16.
-        frontier: Distance of the voxel's centre to the nearest voxel that no ray has reached, m;
-            of such voxels, minus the distance to the nearest one that was reached,
-            (X, Y, Z) float16.
+        frontier: Distance of the voxel's centre to the nearest voxel that no ray has reached, in
+            127ths of the frontier's horizon; of such voxels, minus the distance to the nearest one
+            that was reached, (X, Y, Z) int8.
     """
 
     mean: jax.Array

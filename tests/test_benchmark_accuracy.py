@@ -98,6 +98,9 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     assert (record["stream"], record["seed"], record["frames"]) == ("room", 0, FRAMES)
     served = record["variants"]["served"]
     expected = score(state, FRAMES - 1, sensor_position_world=[0.5, 0, 0])
+    expected |= evaluation.evaluate_lower(
+        jax.jit(lambda points: hio.query(state, points).lower), truth, FRAMES - 1
+    )
     expected["early_then_cm"] = score(states[3], 3)["visible_cm"]
     expected["early_now_cm"] = score(state, 3)["visible_cm"]
     assert served["scores"] == pytest.approx(expected, rel=1e-4)

@@ -84,6 +84,11 @@ def update_frontier(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid
     inner_start = geometry.window_start(config, inner, sensor_world)
     within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
     metres = geometry.read_window(distance * config.voxel_size, within, inner)
-    old = grid.surface.frontier
-    frontier = geometry.write_window(old, inner_start, metres.astype(old.dtype))
+    # Rounded down: never farther than it is.
+    steps = (
+        jnp.floor(metres / geometry.frontier_step_m(config))
+        .clip(-geometry.FRONTIER_STEPS, geometry.FRONTIER_STEPS)
+        .astype(jnp.int8)
+    )
+    frontier = geometry.write_window(grid.surface.frontier, inner_start, steps)
     return grid.replace(surface=grid.surface.replace(frontier=frontier))

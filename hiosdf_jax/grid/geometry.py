@@ -16,6 +16,14 @@ import numpy as np
 
 from hiosdf_jax.config import Config
 
+FRONTIER_STEPS = 127
+"""`Surface.frontier` counts steps, so many to the horizon."""
+
+
+def frontier_step_m(config: Config) -> float:
+    """The length of such a step, m."""
+    return config.frontier_horizon / FRONTIER_STEPS
+
 
 def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the voxels that contain points.

@@ -146,15 +146,15 @@ def frontier(config: Config, known: Surface, points_world: jax.Array) -> jax.Arr
         (...) m; positive in voxels that were seen, negative in others. Differentiable.
     """
     corners = geometry.corners_of(config, points_world)
-    metres = known.frontier.ravel()
-    around = metres[corners.flat].astype(jnp.float32)
+    steps = known.frontier.ravel()
+    around = steps[corners.flat].astype(jnp.float32) * geometry.frontier_step_m(config)
     around = jnp.where(corners.inside, around, -config.frontier_horizon)
     index, _, inside = geometry.voxel_of(config, points_world)
-    seen = inside & (metres[geometry.flat_index(config.grid_shape, index)] > 0)
+    seen = inside & (steps[geometry.flat_index(config.grid_shape, index)] > 0)
     # Beyond the bounds, and after `grow` until the next update, voxels know nothing. Next to a seen
     # voxel the unseen space begins half a voxel before the unseen one's centre; elsewhere they are
     # taken to be as deep in it as the deepest that knows.
-    ignorant = around <= -config.frontier_horizon
+    ignorant = around <= -0.999 * config.frontier_horizon
     deepest = jnp.min(jnp.where(ignorant, jnp.inf, around), axis=-1)
     deepest = jnp.where(jnp.isfinite(deepest), deepest, -config.frontier_horizon)
     filled = jnp.where(ignorant, jnp.minimum(deepest, 0)[..., None], around)
