@@ -78,7 +78,7 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
     area = np.sum((np.asarray(points) - np.asarray(sensor)) ** 2, axis=1)[seen]
     ordered = np.argsort(points[:, 0][seen])
     share = np.cumsum(area[ordered]) / area.sum()
-    expected = float(points[:, 0][seen][ordered][np.argmax(share >= 0.95)])
+    expected = float(points[:, 0][seen][ordered][np.argmax(share >= 0.945)])
     field = field.replace(updates=jnp.int32(0), optimism=jnp.float32(9))
 
     def calibrate(field, ends):
