@@ -33,6 +33,7 @@ _HELD_OUT_POINTS = 20_000  # over all these frames
 # the grid.
 _MESH_SAMPLES = 4e6
 _MESH_FINEST = 0.025  # m
+_SMOOTHINGS = 20  # of the mesh, for its picture
 
 _LEVEL = np.radians(10)  # a normal nearer than this to upwards is that of a floor or a table
 _TILTED = np.radians(2)  # a world whose z is farther than this from upwards is levelled to draw it
@@ -461,7 +462,11 @@ def _write_mesh(output: Path, surface: trimesh.Trimesh, up_world: np.ndarray) ->
             path.unlink(missing_ok=True)
         return
     surface.export(model)
-    view.save_shaded(picture, surface, up_world=up_world.tolist())
+    from trimesh.smoothing import filter_taubin
+
+    # For the eye only: between patches the surface has steps of some millimetres.
+    smooth = filter_taubin(surface.copy(), iterations=_SMOOTHINGS)
+    view.save_shaded(picture, smooth, up_world=up_world.tolist())
 
 
 # The map is an argument, so that these compile once for maps of one configuration.

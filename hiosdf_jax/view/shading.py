@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,6 +27,10 @@ _LIGHT = np.array([-0.35, 0.7, 0.9])  # towards it: the picture's right, level t
 _PALETTE = np.array(  # by height, from low to high: pale, so that the shading carries the shape
     [[0.80, 0.86, 0.94], [0.99, 0.93, 0.82], [0.98, 0.76, 0.56], [0.86, 0.57, 0.53]]
 )
+
+
+# Pieces that lie above this share of the height, and have less than this share of the area.
+_HIGH, _SMALL = 0.6, 0.02
 
 
 def save_shaded(
@@ -72,6 +78,7 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=-1)
     shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
+    shown[shown] = ~_remains_of_ceiling(vertices @ up, faces[shown], length[shown])
     if not shown.any():
         return image[::_SUPERSAMPLING, ::_SUPERSAMPLING]
     normal = normal[shown] / length[shown, None]
@@ -103,6 +110,29 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     image[covered] = tint * factor[:, None]
     image = image.reshape(size[1], _SUPERSAMPLING, size[0], _SUPERSAMPLING, 3)
     return np.clip(image.mean(axis=(1, 3)), 0, 1)
+
+
+def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """Tells faces of small pieces that float near the top: a rough ceiling's that do not look away.
+
+    Args:
+        level: (V,) height of each vertex.
+        faces: (F, 3) vertices of each face.
+        area: (F,) of each face, in any unit.
+
+    Returns:
+        (F,) bool.
+    """
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges), bool), edges.T), (len(level), len(level)))
+    count, piece = connected_components(graph, directed=False)
+    piece = piece[faces[:, 0]]
+    lowest = np.full(count, np.inf)
+    np.minimum.at(lowest, piece, level[faces].min(axis=1))
+    low, high = np.percentile(level[faces], [1, 99])
+    floats = lowest > low + _HIGH * (high - low)
+    is_small = np.bincount(piece, area, count) < _SMALL * area.sum()
+    return (floats & is_small)[piece]
 
 
 def _camera_axes(vertices: np.ndarray, up: np.ndarray) -> np.ndarray:
