@@ -237,3 +237,14 @@ import hiosdf_jax, hiosdf_jax.datasets, hiosdf_jax.evaluation, hiosdf_jax.mesh
 import hiosdf_jax.sensors, hiosdf_jax.view
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_small_pieces_near_the_top_are_a_ceilings_remains():
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    # A floor, a small piece high up, a small one low down (a chair's seat), a large one high up.
+    pieces = [10 * square, square + [2, 2, 2.4], square + [5, 5, 0.5], 5 * square + [0, 0, 2.5]]
+    vertices = np.concatenate(pieces)
+    faces = np.array([[4 * k, 4 * k + i, 4 * k + i + 1] for k in range(4) for i in (1, 2)])
+    area = np.repeat([50.0, 0.5, 0.5, 12.5], 2)
+    remains = shading._remains_of_ceiling(vertices[:, 2], faces, area)
+    assert remains.tolist() == [False] * 2 + [True] * 2 + [False] * 4

@@ -78,9 +78,9 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=-1)
     shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
-    shown[shown] = ~_remains_of_ceiling(vertices @ up, faces[shown], length[shown])
     if not shown.any():
         return image[::_SUPERSAMPLING, ::_SUPERSAMPLING]
+    shown[shown] = ~_remains_of_ceiling(vertices @ up, faces[shown], length[shown])
     normal = normal[shown] / length[shown, None]
     corners = vertices[faces[shown]]  # (F, 3, 3)
 
