@@ -242,7 +242,8 @@ import hiosdf_jax.sensors, hiosdf_jax.view
 def test_small_pieces_near_the_top_are_a_ceilings_remains():
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     # A floor, a small piece high up, a small one low down (a chair's seat), a large one high up.
-    pieces = [10 * square, square + [2, 2, 2.4], square + [5, 5, 0.5], 5 * square + [0, 0, 2.5]]
+    places = np.array([[0, 0, 0], [2, 2, 2.4], [5, 5, 0.5], [0, 0, 2.5]])
+    pieces = [edge * square + place for edge, place in zip((10, 1, 1, 5), places, strict=True)]
     vertices = np.concatenate(pieces)
     faces = np.array([[4 * k, 4 * k + i, 4 * k + i + 1] for k in range(4) for i in (1, 2)])
     area = np.repeat([50.0, 0.5, 0.5, 12.5], 2)
