@@ -32,21 +32,6 @@ class _Failure(Exception):
         self.code = code
 
 
-class _First:
-    """The first frames of a stream, as a stream."""
-
-    def __init__(self, stream: Stream, count: int) -> None:
-        self._stream, self._count = stream, min(count, len(stream))
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        if not 0 <= index < self._count:
-            raise IndexError(f"index = {index}, expected 0 <= index < {self._count}")
-        return self._stream[index]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command.
 
@@ -137,7 +122,8 @@ def _map(options: argparse.Namespace) -> None:
     if isinstance(stream, datasets.NpzStream) and options.ground_truth is None:
         truth = _checked(lambda: datasets.ground_truth(options.stream))
     if options.frames is not None:
-        stream = _First(stream, options.frames)
+        count = min(options.frames, len(stream))
+        stream = datasets.FrameStream(options.stream, count, stream.__getitem__)
     bounds, max_range = options.bounds, options.max_range
     if bounds is not None:
         bounds = (tuple(bounds[:3]), tuple(bounds[3:]))

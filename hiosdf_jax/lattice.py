@@ -27,14 +27,19 @@ def sample_counts(size: Any, resolution: float) -> tuple[int, int, int]:
     Raises:
         ValueError: The spacing is not positive, or would take too many samples.
     """
-    if not (math.isfinite(resolution) and resolution > 0):
-        raise ValueError(f"resolution is {resolution} m, expected > 0")
+    check_resolution(resolution)
     # Tolerant, so that 3 m at 0.1 m are 31 samples and not 32.
     intervals = np.ceil(np.asarray(size, float) / resolution - 1e-6)
     x, y, z = (int(n) + 1 for n in np.maximum(intervals, 1))
     if x * y * z > _MOST_SAMPLES:
         raise ValueError(f"resolution is {resolution} m: {x * y * z} samples are too many")
     return x, y, z
+
+
+def check_resolution(resolution: float) -> None:
+    """Raises a ValueError if a spacing, m, is not positive."""
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise ValueError(f"resolution is {resolution} m, expected > 0")
 
 
 def bounds(baked: Baked) -> tuple[jax.Array, jax.Array]:

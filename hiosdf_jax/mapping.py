@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
@@ -17,14 +17,12 @@ from hiosdf_jax.grid import distance, frontier, geometry, rays, sampling, surfac
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
+from hiosdf_jax.rigid import is_rigid
 from hiosdf_jax.samples import concatenate
 from hiosdf_jax.state import Field, Flag, Grid, MapState, Report, Surface
 
 # The grid's floats as they are kept between updates: half the memory, and finer than the noise.
 _STORED = jnp.float16
-
-# How far R^T R may be from the identity: real trajectories are written with few digits.
-_RIGID_TOLERANCE = 5e-3
 
 
 def init(config: Config, key: jax.Array) -> MapState:
@@ -144,7 +142,7 @@ def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    rigid = _is_rigid(pose)
+    rigid = is_rigid(pose)
     usable = rigid & jnp.any(finite)
     flags = (
         state.report.flags
@@ -162,32 +160,25 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     config = state.config
     key, grid_key, local_key, order_key, check_key = jax.random.split(state.key, 5)
 
-    # The cloud in the world.
-    cloud = jnp.where(finite[:, None], cloud, 0)
-    ranges = surface.safe_norm(cloud)
-    in_range = finite & (ranges >= config.min_range)
-    ends = in_range & (ranges <= config.max_range)
-    sensor_world = pose[:3, 3]
-    offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
-    points_world = sensor_world + offsets_world
-    directions_world = offsets_world / jnp.maximum(ranges, 1e-6)[:, None]
-    _, _, inside = geometry.voxel_of(config, points_world)
+    beams = place_cloud(config, cloud, finite, pose)
+    sensor_world = beams.sensor_world
 
     # How well the map so far foretold the newest cloud.
+    used = beams.ends & beams.inside
     optimism = uncertainty.calibrate(
-        field_of(state), points_world, ends & inside, sensor_world, check_key
+        field_of(state), beams.points_world, used, sensor_world, check_key
     )
 
     # The coarse grid (paper, IV-B).
     grid = _widen(state.grid)
-    grid = surface.fuse_hits(config, grid, points_world, ends, sensor_world)
+    grid = surface.fuse_hits(config, grid, beams.points_world, beams.ends, sensor_world)
     grid = rays.trace_rays(
         config,
         grid,
-        directions_world,
-        jnp.minimum(ranges, config.max_range),
-        in_range,
-        ends,
+        beams.directions_world,
+        beams.free_ranges,
+        beams.in_range,
+        beams.ends,
         sensor_world,
     )
     grid = _narrow(rays.fade_evidence(config, grid, sensor_world))
@@ -197,16 +188,14 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     # What the network learns from (IV-B, IV-C), and its fit (IV-D).
     samples = concatenate(
         sampling.sample_grid(config, grid, grid_key),
-        sample_local(config, points_world, ends, sensor_world, local_key),
+        sample_local(config, beams.points_world, beams.ends, sensor_world, local_key),
     )
-    epochs = jnp.where(state.updates < config.warmup_updates, config.warmup_epochs, config.epochs)
-    # A running mean over the first updates, so that the untrained network is never served.
-    average = jnp.minimum(config.weight_average, state.updates / (state.updates + 1.0))
+    epochs, average = schedule(config, state.updates)
     network, parts, trained = training.train(
         config, state.network, samples, epochs, average, order_key
     )
 
-    outside = ends & ~inside
+    outside = beams.ends & ~beams.inside
     flags = (
         state.report.flags
         | jnp.where(jnp.any(outside), Flag.POINTS_OUTSIDE, 0).astype(jnp.uint32)
@@ -223,15 +212,83 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
         key=key,
         updates=state.updates + 1,
         report=Report(
-            points_used=count(ends & inside),
+            points_used=count(used),
             points_outside=count(outside),
-            points_out_of_range=count(finite & ~ends),
+            points_out_of_range=count(finite & ~beams.ends),
             points_invalid=count(~finite),
             sdf_loss=parts.sdf,
             eikonal_loss=parts.eikonal,
             flags=flags,
         ),
     )
+
+
+class Beams(NamedTuple):
+    """A cloud as rays in the world.
+
+    Attributes:
+        points_world: (N, 3) m, where they end.
+        directions_world: (N, 3) unit vectors.
+        free_ranges: (N,) m, the part of them that counts as free.
+        in_range: (N,) bool, not nearer than min_range: those tell of free space.
+        ends: (N,) bool, and not farther than max_range: those tell of a surface.
+        inside: (N,) bool, end in the bounds.
+        sensor_world: (3,) m, where they begin.
+    """
+
+    points_world: jax.Array
+    directions_world: jax.Array
+    free_ranges: jax.Array
+    in_range: jax.Array
+    ends: jax.Array
+    inside: jax.Array
+    sensor_world: jax.Array
+
+
+def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Beams:
+    """Takes a cloud to the world.
+
+    Args:
+        config: The map's configuration.
+        cloud: (N, 3) m, sensor frame.
+        finite: (N,) bool; other rows are no returns.
+        pose: (4, 4) T_world_sensor.
+
+    Returns:
+        The rays.
+    """
+    cloud = jnp.where(finite[:, None], cloud, 0)
+    ranges = surface.safe_norm(cloud)
+    in_range = finite & (ranges >= config.min_range)
+    sensor_world = pose[:3, 3]
+    offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
+    points_world = sensor_world + offsets_world
+    _, _, inside = geometry.voxel_of(config, points_world)
+    return Beams(
+        points_world=points_world,
+        directions_world=offsets_world / jnp.maximum(ranges, 1e-6)[:, None],
+        free_ranges=jnp.minimum(ranges, config.max_range),
+        in_range=in_range,
+        ends=in_range & (ranges <= config.max_range),
+        inside=inside,
+        sensor_world=sensor_world,
+    )
+
+
+def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How the network is trained at an update.
+
+    Args:
+        config: The map's configuration.
+        updates: () int32, that the map has had.
+
+    Returns:
+        epochs: () int32.
+        average: () share of the old weights in those that are served; a running mean over the
+            first updates, so that the untrained network is never served.
+    """
+    epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
+    return epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
 
 
 def _empty_grid(config: Config) -> Grid:
@@ -272,17 +329,6 @@ def _narrow(grid: Grid) -> Grid:
     )
 
 
-def _is_rigid(pose: Any, np: Any = jnp) -> Any:
-    """() bool; with numpy for a pose outside jit, which costs no dispatches to a device."""
-    rotation = pose[:3, :3]
-    # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
-    gram = np.sum(rotation[:, :, None] * rotation[:, None, :], axis=0)
-    handed = np.sum(np.cross(rotation[0], rotation[1]) * rotation[2])
-    orthonormal = np.all(np.abs(gram - np.eye(3)) <= _RIGID_TOLERANCE)
-    last_row = np.all(np.abs(pose[3] - np.array([0.0, 0, 0, 1])) <= 1e-6)
-    return orthonormal & last_row & (handed > 0) & np.all(np.isfinite(pose))
-
-
 def _check_shapes(cloud: Any, pose: Any) -> None:
     if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
         raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
@@ -293,7 +339,7 @@ def _check_shapes(cloud: Any, pose: Any) -> None:
 def _check_values(cloud: np.ndarray, pose: np.ndarray) -> None:
     if not np.isfinite(pose).all():
         raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
-    if not _is_rigid(pose, np):
+    if not is_rigid(pose, np):
         raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
     if not _finite_rows(cloud).any():
         raise ValueError(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from hiosdf_jax.lattice import sample_counts
+from hiosdf_jax.lattice import check_resolution, sample_counts
 from hiosdf_jax.query import query
 from hiosdf_jax.state import Field, MapState
 
@@ -35,7 +35,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     Raises:
         ValueError: The resolution is not positive.
     """
-    _check_resolution(resolution)
+    check_resolution(resolution)
     low, high = np.asarray(field.config.bounds)
     shape = sample_counts(high - low, resolution)
     count = math.prod(shape)
@@ -80,7 +80,7 @@ def mesh_from_samples(
     import skimage.measure
     import trimesh
 
-    _check_resolution(resolution)
+    check_resolution(resolution)
     if reach < 1:
         raise ValueError(f"reach is {reach}, expected at least 1 sample")
     sdf, observed = np.asarray(sdf, np.float32), np.asarray(observed, bool)
@@ -119,8 +119,3 @@ def mesh_from_samples(
 def _sample(field: MapState | Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
     answer = query(field, points_world)
     return answer.sdf, answer.observed  # the gradient is not used, so that XLA leaves it out
-
-
-def _check_resolution(resolution: float) -> None:
-    if not (math.isfinite(resolution) and resolution > 0):
-        raise ValueError(f"resolution is {resolution} m, expected > 0")

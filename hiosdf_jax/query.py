@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax import lattice, served, uncertainty
-from hiosdf_jax.grid import lookup
+from hiosdf_jax.gradient import value_and_gradient
+from hiosdf_jax.grid import geometry, lookup
 from hiosdf_jax.state import Baked, Field, MapState, Query
 
 _FAR = 1e30  # m
@@ -127,8 +128,7 @@ def _query(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
 def _distance_and_grad(
     field: Field | Baked, points: jax.Array, unknown: Unknown
 ) -> tuple[jax.Array, jax.Array]:
-    value, pull = jax.vjp(lambda points: _distance(field, points, unknown), points)
-    return value, pull(jnp.ones_like(value))[0]
+    return value_and_gradient(lambda points: _distance(field, points, unknown), points)
 
 
 @_compiled
@@ -156,8 +156,7 @@ def _split(field: Field | Baked, points: jax.Array) -> tuple[jax.Array, jax.Arra
     """The nearest points of the box, (..., 3) m, and the distances to it, (...) m."""
     low, high = lattice.bounds(field) if isinstance(field, Baked) else field.config.bounds
     low, high = jnp.asarray(low, points.dtype), jnp.asarray(high, points.dtype)
-    # Not jnp.clip, which halves the gradient on the faces.
-    nearest = jnp.where(points < low, low, jnp.where(points > high, high, points))
+    nearest = geometry.clip_to_box(points, low, high)
     beyond = points - nearest
     # Scaled by the largest component, since the square of a far point would overflow.
     scale = jnp.maximum(jnp.max(jnp.abs(jax.lax.stop_gradient(beyond)), axis=-1), 1e-6)

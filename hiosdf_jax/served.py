@@ -10,6 +10,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax.config import Config
+from hiosdf_jax.gradient import value_and_gradient
 from hiosdf_jax.grid import lookup
 from hiosdf_jax.network import siren
 from hiosdf_jax.state import Field
@@ -46,6 +48,19 @@ def network_sdf(field: Field, points_world: jax.Array) -> jax.Array:
     return siren.predict(field.config, field.params, points_world - field.origin_world)
 
 
+def network_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Signed distance by the network alone, and its gradient.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        The distance (...) m and its gradient (..., 3).
+    """
+    return value_and_gradient(lambda points: network_sdf(field, points), points_world)
+
+
 def served_sdf(field: Field, points_world: jax.Array) -> jax.Array:
     """Signed distance that queries answer.
 
@@ -61,7 +76,7 @@ def served_sdf(field: Field, points_world: jax.Array) -> jax.Array:
     if config.grid_share == 0:
         return network
     grid = lookup.grid_sdf(config, field.surface, points_world)
-    return _combine(field, points_world, grid, network)
+    return _combine(config, grid, network, lookup.frontier(config, field.surface, points_world))
 
 
 def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -84,18 +99,14 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     gap = jnp.minimum(jnp.abs(network - nearest.sdf), limit)
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
     doubt = lookup.doubt(config, field.surface, points_world)
-    served = _combine(field, points_world, nearest.sdf, network)
-    cautious = jnp.minimum(served, doubt)
-    # What has not been seen may hide a surface that is nearer than all that were.
     frontier = lookup.frontier(config, field.surface, points_world)
+    cautious = jnp.minimum(_combine(config, nearest.sdf, network, frontier), doubt)
+    # What has not been seen may hide a surface that is nearer than all that were.
     hidden = jnp.maximum(frontier, cautious - _HIDDEN_VOXELS * config.voxel_size)
     return jnp.minimum(cautious, hidden), scale
 
 
-def _combine(
-    field: Field, points_world: jax.Array, grid: jax.Array, network: jax.Array
-) -> jax.Array:
-    config = field.config
+def _combine(config: Config, grid: jax.Array, network: jax.Array, frontier: jax.Array) -> jax.Array:
     if config.grid_share == 0:
         return network
     # No more than the distance itself: surfaces stay where the grid has them, thin ones too.
@@ -104,6 +115,5 @@ def _combine(
     start, end = (share * config.distance_horizon for share in _FADE)
     far = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)
     start, end = (voxels * config.voxel_size for voxels in _FADE_UNSEEN_VOXELS)
-    frontier = lookup.frontier(config, field.surface, points_world)
     unseen = jnp.clip((-frontier - start) / (end - start), 0, 1)
     return near + jnp.maximum(far, unseen) * (network - near)

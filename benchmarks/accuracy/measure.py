@@ -153,11 +153,6 @@ def measure(
     }
 
 
-def _network_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    value, pull = jax.vjp(lambda points: served.network_sdf(field, points), points_world)
-    return value, pull(jax.numpy.ones_like(value))[0]
-
-
 def _grid_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
     return lookup.grid_sdf_and_grad(field.config, field.surface, points_world)
 
@@ -165,7 +160,7 @@ def _grid_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array
 # The map is an argument, so that each compiles once for all maps of one configuration.
 VARIANTS: dict[str, Callable[..., tuple[jax.Array, jax.Array]]] = {
     "grid": jax.jit(_grid_sdf_and_grad),
-    "network": jax.jit(_network_sdf_and_grad),
+    "network": jax.jit(served.network_sdf_and_grad),
     "served": jax.jit(hio.sdf_and_grad),
 }
 _lower = jax.jit(lambda field, points: hio.query(field, points).lower)

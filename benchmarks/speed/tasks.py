@@ -490,10 +490,7 @@ def _device_memory() -> dict[str, int]:
     return jax.devices()[0].memory_stats() or {}
 
 
-@jax.jit
-def _network(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    value, pull = jax.vjp(lambda points: served.network_sdf(field, points), points_world)
-    return value, pull(jnp.ones_like(value))[0]
+_network = jax.jit(served.network_sdf_and_grad)
 
 
 @jax.jit

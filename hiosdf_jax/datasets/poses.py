@@ -1,12 +1,11 @@
-"""What makes a recorded pose usable: finite, and rigid to the digits that it was written with."""
+"""The check of a recorded pose, with a message that says where it stands."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-# On R^T R - I: real trajectories are written with few digits. The same as an update's.
-_RIGID_TOLERANCE = 5e-3
+from hiosdf_jax.rigid import is_rigid
 
 
 def check_pose(pose: ArrayLike, source: str) -> np.ndarray:
@@ -30,10 +29,7 @@ def check_pose(pose: ArrayLike, source: str) -> np.ndarray:
         raise ValueError(
             f"{source}: pose has values that are not finite, expected T_world_sensor: {shown}"
         )
-    rotation = matrix[:3, :3]
-    orthonormal = np.abs(rotation.T @ rotation - np.eye(3)).max() <= _RIGID_TOLERANCE
-    last_row = np.abs(matrix[3] - [0, 0, 0, 1]).max() <= 1e-6
-    if not (orthonormal and last_row and np.linalg.det(rotation) > 0):
+    if not is_rigid(matrix, np):
         raise ValueError(
             f"{source}: pose is not rigid, expected a rotation and a translation: {shown}"
         )

@@ -110,8 +110,15 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
 def clamp(config: Config, points_world: jax.Array) -> jax.Array:
     """Moves (..., 3) points outside the bounds, m, to the nearest point of the box."""
     low, high = jnp.asarray(config.bounds, points_world.dtype)
-    # Not jnp.clip, which halves the gradient on the faces.
-    return jnp.where(points_world < low, low, jnp.where(points_world > high, high, points_world))
+    return clip_to_box(points_world, low, high)
+
+
+def clip_to_box(points: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Moves (..., 3) points outside a box to its nearest point.
+
+    Unlike jnp.clip, which halves the gradient on the faces.
+    """
+    return jnp.where(points < low, low, jnp.where(points > high, high, points))
 
 
 def window_shape(config: Config, reach: float) -> tuple[int, int, int]:

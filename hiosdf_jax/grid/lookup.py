@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
+from hiosdf_jax.gradient import value_and_gradient
 from hiosdf_jax.grid import geometry, surface
 from hiosdf_jax.grid.distance import NO_FEATURE
 from hiosdf_jax.state import Surface
@@ -112,8 +113,7 @@ def grid_sdf_and_grad(
     Returns:
         The distance (...) m and its gradient (..., 3).
     """
-    value, pull = jax.vjp(lambda points: grid_sdf(config, known, points), points_world)
-    return value, pull(jnp.ones_like(value))[0]
+    return value_and_gradient(lambda points: grid_sdf(config, known, points), points_world)
 
 
 def doubt(config: Config, known: Surface, points_world: jax.Array) -> jax.Array:

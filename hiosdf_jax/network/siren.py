@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax.config import Config
+from hiosdf_jax.gradient import value_and_gradient
 from hiosdf_jax.network import passes
 from hiosdf_jax.network.sine import sine
 
@@ -99,8 +100,7 @@ def predict_with_gradient(
 @predict_with_gradient.defjvp
 def _predict_with_gradient_jvp(config: Config, primals: Any, tangents: Any) -> Any:
     def plain(params: Any, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-        value, pull = jax.vjp(lambda x: jnp.asarray(siren(config).apply(params, x)), points)
-        return value, pull(jnp.ones_like(value))[0]
+        return value_and_gradient(lambda x: jnp.asarray(siren(config).apply(params, x)), points)
 
     return jax.jvp(plain, primals, tangents)
 

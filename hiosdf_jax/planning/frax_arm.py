@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax.query import AnyField, Unknown, sdf
+from hiosdf_jax.gradient import value_and_gradient
+from hiosdf_jax.planning.clearance import sphere_clearance
+from hiosdf_jax.query import AnyField, Unknown
 
 if TYPE_CHECKING:
     from frax import Manipulator
@@ -68,7 +70,7 @@ def arm_clearance(
         ValueError: An argument is not what it should be.
     """
     centers_world, radii = arm_spheres(arm, q, pose_world_base)
-    return jnp.min(sdf(field, centers_world, unknown) - radii, axis=-1)
+    return jnp.min(sphere_clearance(field, centers_world, radii, unknown), axis=-1)
 
 
 def arm_clearance_and_grad(
@@ -94,5 +96,4 @@ def arm_clearance_and_grad(
         ValueError: An argument is not what it should be.
     """
     q = jnp.asarray(q, jnp.float32)
-    value, pull = jax.vjp(lambda x: arm_clearance(field, arm, x, pose_world_base, unknown), q)
-    return value, pull(jnp.ones_like(value))[0]
+    return value_and_gradient(lambda q: arm_clearance(field, arm, q, pose_world_base, unknown), q)
