@@ -1,12 +1,14 @@
 """The sine, the SIREN and its training against plain numpy in float64."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax.network import siren, training
+from hiosdf_jax.network import siren, tiles, training
 from hiosdf_jax.network.sine import cosine, sine
 from hiosdf_jax.samples import Samples
 
@@ -148,12 +150,58 @@ def test_epochs_and_batches_are_honoured():
     trained, *_ = train(config, network, samples, 4)
     assert int(trained.optimizer[0].count) == 12
     parts = training._split(config, samples, jax.random.key(1))
-    assert parts.points_world.shape == (3, 21, 3)
+    assert parts.points_world.shape == (3, 1, 21, 3)
     rows = np.asarray(parts.points_world).reshape(-1, 3)
     assert len(np.unique(rows, axis=0)) == 63
     original = {tuple(row): s for row, s in zip(*map(np.asarray, samples[:2]), strict=True)}
     flat = np.asarray(parts.sdf).ravel()
     assert all(original[tuple(row)] == s for row, s in zip(rows, flat, strict=True))
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_step_by_tiles_is_a_step(monkeypatch, every):
+    config = dataclasses.replace(TINY, eikonal_every=every)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(70)
+    whole, *_ = train(config, network, samples, 1)
+    monkeypatch.setattr(tiles, "_ROWS", 16)
+    batch = jax.tree.map(
+        lambda array: array[0], training._split(config, samples, jax.random.key(0))
+    )
+    assert batch.sdf.shape == (5, 14)
+    tiled, parts, _ = train(config, network, samples, 1)
+    sloped = -(-14 // every)
+    points = batch.points_world - network.origin_world
+    value = numpy_forward(config, network.params, points.reshape(-1, 3)).reshape(5, 14)
+    slope = np.linalg.norm(numpy_gradient(config, network.params, points.reshape(-1, 3)), axis=1)
+    error, used = np.abs(slope.reshape(5, 14) - 1)[:, :sloped], np.asarray(batch.weight) > 0
+    np.testing.assert_allclose(parts.sdf, np.abs(value - batch.sdf)[used].mean(), rtol=1e-4)
+    np.testing.assert_allclose(parts.eikonal, error[used[:, :sloped]].mean(), rtol=1e-3)
+    if every == 1:  # otherwise the slopes of other samples are taken
+        for a, b in zip(jax.tree.leaves(tiled), jax.tree.leaves(whole), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 16, 17, 50])
+def test_tiles_are_all_rows(monkeypatch, rows):
+    monkeypatch.setattr(tiles, "_ROWS", 16)
+    dealt = tiles.tile_index(rows)
+    assert dealt.shape[1] <= 16 and dealt.size < rows + len(dealt) + 1
+    assert sorted(dealt[dealt < rows]) == list(range(rows))
+    points = np.random.default_rng(0).normal(size=(rows, 3)).astype(np.float32)
+    sizes = []
+
+    def function(rows):
+        sizes.append(rows.shape[0])
+        return rows[..., 0] * 2, rows + 1
+
+    doubled, moved = tiles.map_tiles(function, jnp.asarray(points))
+    np.testing.assert_array_equal(doubled, points[:, 0] * 2)
+    np.testing.assert_array_equal(moved, points + 1)
+    assert max(sizes) <= 16
+    single = tiles.map_tiles(lambda rows: rows[..., 0], jnp.ones(3))
+    assert single.shape == ()
+    stacked = tiles.map_tiles(lambda rows: rows, jnp.asarray(points[:, None] + np.zeros((1, 7, 1))))
+    np.testing.assert_allclose(stacked, np.broadcast_to(points[:, None], (rows, 7, 3)))
 
 
 def test_the_average_is_of_old_and_new_weights():

@@ -120,7 +120,9 @@ def _dot(x: jax.Array, kernel: jax.Array, dtype: Any) -> jax.Array:
 @jax.custom_vjp
 def _activation(frequency: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     sine, cosine = sine_and_cosine(frequency * z)
-    return sine.astype(stored_dtype()), (frequency * cosine).astype(stored_dtype())
+    result = sine.astype(stored_dtype()), (frequency * cosine).astype(stored_dtype())
+    # Computed once: XLA would do it again in each of the kernels that read them.
+    return jax.lax.optimization_barrier(result)
 
 
 def _activation_forward(frequency: jax.Array, z: jax.Array) -> tuple[Any, Any]:

@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.gradient import value_and_gradient
-from hiosdf_jax.network import passes
+from hiosdf_jax.network import passes, tiles
 from hiosdf_jax.network.sine import sine
 
 
@@ -68,7 +68,7 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
     Returns:
         (...) m. Differentiable any number of times.
     """
-    return passes.value(config.frequency, params, points)
+    return tiles.map_tiles(lambda rows: passes.value(config.frequency, params, rows), points)
 
 
 @functools.partial(predict.defjvp, symbolic_zeros=True)
@@ -94,7 +94,9 @@ def predict_with_gradient(
     Returns:
         The values (...) m and their gradients (..., 3). Differentiable any number of times.
     """
-    return passes.value_and_gradient(config.frequency, params, points)
+    return tiles.map_tiles(
+        lambda rows: passes.value_and_gradient(config.frequency, params, rows), points
+    )
 
 
 @predict_with_gradient.defjvp

@@ -10,9 +10,12 @@ import numpy as np
 import optax
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.network import passes, siren
+from hiosdf_jax.network import passes, siren, tiles
 from hiosdf_jax.samples import Samples
 from hiosdf_jax.state import Network
+
+# Of the residuals only as many are looked at: their median is known well enough then.
+_RESIDUALS = 8192
 
 
 class Losses(NamedTuple):
@@ -58,18 +61,7 @@ def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> 
     Returns:
         Their means over the samples with weight.
     """
-    sloped = -(-points.shape[0] // config.eikonal_every)
-    value, gradient = passes.value_and_gradient(config.frequency, params, points[:sloped])
-    if sloped < points.shape[0]:
-        others = passes.value(config.frequency, params, points[sloped:])
-        value = jnp.concatenate([value, others])
-    # Not a safe norm: where the gradient is 0 its direction is undefined anyway, and 1e-12 is
-    # enough to keep the derivative finite.
-    slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + 1e-12)
-    return Losses(
-        _mean(jnp.abs(value - samples.sdf), samples.weight),
-        _mean(jnp.abs(slope - 1), samples.weight[:sloped]),
-    )
+    return _means(_sums(config, params, points, samples), _weights(config, samples))
 
 
 def train(
@@ -97,19 +89,27 @@ def train(
     optimizer = _optimizer(config)
     batches = _split(config, samples, key)
 
-    def objective(params: Any, batch: Samples) -> tuple[jax.Array, Losses]:
-        points = batch.points_world - network.origin_world
-        parts = losses(config, params, points, batch)
+    def objective(params: Any, tile: Samples, weights: Losses) -> tuple[jax.Array, Losses]:
+        points = tile.points_world - network.origin_world
+        sums = _sums(config, params, points, tile)
+        parts = _means(sums, weights)
         loss = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
         # A sum instead of a mean: single samples' shares of it would vanish in float16.
-        return loss * _count(batch), parts
+        return loss * _count(weights), sums
 
     def step(carry: tuple[Any, Any], batch: Samples) -> tuple[tuple[Any, Any], Losses]:
         params, state = carry
-        gradients, parts = jax.grad(objective, has_aux=True)(params, batch)
-        gradients = jax.tree.map(lambda gradient: gradient / _count(batch), gradients)
+        weights = _weights(config, batch)
+
+        def add(total: tuple[Any, Losses], tile: Samples) -> tuple[tuple[Any, Losses], None]:
+            part = jax.grad(objective, has_aux=True)(params, tile, weights)
+            return jax.tree.map(jnp.add, total, part), None
+
+        nothing = jax.tree.map(jnp.zeros_like, (params, weights))
+        (gradients, sums), _ = jax.lax.scan(add, nothing, batch)
+        gradients = jax.tree.map(lambda gradient: gradient / _count(weights), gradients)
         updates, state = optimizer.update(gradients, state, params)
-        return (optax.apply_updates(params, updates), state), parts
+        return (optax.apply_updates(params, updates), state), _means(sums, weights)
 
     def epoch(_: jax.Array, carry: tuple[Any, Any, Losses]) -> tuple[Any, Any, Losses]:
         (params, state), parts = jax.lax.scan(step, carry[:2], batches)
@@ -124,28 +124,63 @@ def train(
     served = jax.tree.map(
         lambda old, new: average * old + (1 - average) * new, network.served, params
     )
-    points = samples.points_world - network.origin_world
-    residual = siren.predict(config, served, points) - samples.sdf
-    served = siren.shift_output(config, served, -_median(residual, samples.weight))
+    every = max(1, samples.sdf.shape[0] // _RESIDUALS)
+    some = jax.tree.map(lambda array: array[::every], samples)
+    residual = siren.predict(config, served, some.points_world - network.origin_world) - some.sdf
+    served = siren.shift_output(config, served, -_median(residual, some.weight))
     trained = network.replace(params=params, served=served, optimizer=state)
     kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), trained, network)
     return kept, parts, finite
 
 
 def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
-    """Shuffles samples into (batches, size) parts; what does not fill a part is left out.
+    """Shuffles samples into (batches, tiles, size) parts; what does not fill a batch is left out.
 
-    A single part needs no chance: one sample in `eikonal_every` comes first.
+    A single batch needs no chance: one sample in `eikonal_every` comes first in its tile.
     """
     count = samples.sdf.shape[0]
     size = count // config.batches
-    if config.batches == 1:
-        order = np.argsort(np.arange(count) % config.eikonal_every > 0, kind="stable")
-    else:
-        order = jax.random.permutation(key, count)[: size * config.batches]
-    return jax.tree.map(
-        lambda array: array[order].reshape(config.batches, size, *array.shape[1:]), samples
+    dealt = tiles.tile_index(size)
+    first = np.argsort(np.arange(dealt.shape[1]) % config.eikonal_every > 0, kind="stable")
+    dealt = dealt[:, first]
+    order = jnp.arange(count) if config.batches == 1 else jax.random.permutation(key, count)
+    order = order[: size * config.batches].reshape(config.batches, size)
+    batches = jax.tree.map(lambda array: array[order[:, np.minimum(dealt, size - 1)]], samples)
+    return batches._replace(weight=jnp.where(dealt < size, batches.weight, 0))
+
+
+def _sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
+    """The losses times what `_weights` returns."""
+    sloped = _sloped(config, samples)
+    value, gradient = passes.value_and_gradient(config.frequency, params, points[:sloped])
+    if sloped < points.shape[0]:
+        others = passes.value(config.frequency, params, points[sloped:])
+        value = jnp.concatenate([value, others])
+    # Not a safe norm: where the gradient is 0 its direction is undefined anyway, and 1e-12 is
+    # enough to keep the derivative finite.
+    slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + 1e-12)
+    return Losses(
+        jnp.sum(jnp.abs(value - samples.sdf) * samples.weight),
+        jnp.sum(jnp.abs(slope - 1) * samples.weight[:sloped]),
     )
+
+
+def _weights(config: Config, samples: Samples) -> Losses:
+    """Sums of the weights of all (..., N) samples, and of those whose slope counts."""
+    sloped = samples.weight[..., : _sloped(config, samples)]
+    return Losses(jnp.sum(samples.weight), jnp.sum(sloped))
+
+
+def _sloped(config: Config, samples: Samples) -> int:
+    return -(-samples.weight.shape[-1] // config.eikonal_every)
+
+
+def _means(sums: Losses, weights: Losses) -> Losses:
+    return jax.tree.map(lambda total, weight: total / jnp.maximum(weight, 1), sums, weights)
+
+
+def _count(weights: Losses) -> jax.Array:
+    return jnp.maximum(weights.sdf, 1)
 
 
 def _median(values: jax.Array, weight: jax.Array) -> jax.Array:
@@ -156,11 +191,3 @@ def _median(values: jax.Array, weight: jax.Array) -> jax.Array:
 
 def _optimizer(config: Config) -> optax.GradientTransformation:
     return optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
-
-
-def _count(samples: Samples) -> jax.Array:
-    return jnp.maximum(jnp.sum(samples.weight), 1)
-
-
-def _mean(values: jax.Array, weight: jax.Array) -> jax.Array:
-    return jnp.sum(values * weight) / jnp.maximum(jnp.sum(weight), 1)
