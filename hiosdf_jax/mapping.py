@@ -13,16 +13,13 @@ import numpy as np
 
 from hiosdf_jax import uncertainty
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid import distance, frontier, geometry, rays, sampling, surface
+from hiosdf_jax.grid import distance, evidence, frontier, geometry, rays, sampling, surface
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
 from hiosdf_jax.rigid import is_rigid
 from hiosdf_jax.samples import concatenate
-from hiosdf_jax.state import Field, Flag, Grid, MapState, Report, Surface
-
-# The grid's floats as they are kept between updates: half the memory, and finer than the noise.
-_STORED = jnp.float16
+from hiosdf_jax.state import Field, Flag, MapState, Report
 
 
 def init(config: Config, key: jax.Array) -> MapState:
@@ -48,7 +45,7 @@ def init(config: Config, key: jax.Array) -> MapState:
 
     return MapState(
         config=config,
-        grid=_empty_grid(config),
+        grid=evidence.empty_grid(config),
         network=training.init_network(config, network_key),
         optimism=uncertainty.initial(),
         key=key,
@@ -132,7 +129,7 @@ def grow(state: MapState, bounds: Any) -> MapState:
     start = np.subtract(old.corner_index, new.corner_index)
     place = tuple(slice(a, a + n) for a, n in zip(start, old.grid_shape, strict=True))
     grid = jax.tree.map(
-        lambda empty, known: empty.at[place].set(known), _empty_grid(new), state.grid
+        lambda empty, known: empty.at[place].set(known), evidence.empty_grid(new), state.grid
     )
     return state.replace(config=new, grid=grid)
 
@@ -170,18 +167,20 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     )
 
     # The coarse grid (paper, IV-B).
-    grid = _widen(state.grid)
-    grid = surface.fuse_hits(config, grid, beams.points_world, beams.ends, sensor_world)
-    grid = rays.trace_rays(
+    start, window = evidence.read_evidence(config, state.grid, sensor_world)
+    window = surface.fuse_hits(config, window, start, beams.points_world, beams.ends, sensor_world)
+    window = rays.trace_rays(
         config,
-        grid,
+        window,
+        start,
         beams.directions_world,
         beams.free_ranges,
         beams.in_range,
         beams.ends,
         sensor_world,
     )
-    grid = _narrow(rays.fade_evidence(config, grid, sensor_world))
+    window = rays.fade_evidence(config, window)
+    grid = evidence.write_evidence(state.grid, start, window)
     grid = distance.update_distances(config, grid, sensor_world)
     grid = frontier.update_frontier(config, grid, sensor_world)
 
@@ -289,44 +288,6 @@ def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
     return epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
-
-
-def _empty_grid(config: Config) -> Grid:
-    shape = config.grid_shape
-    return Grid(
-        hits=jnp.zeros(shape, _STORED),
-        passes=jnp.zeros(shape, _STORED),
-        behind=jnp.zeros(shape, _STORED),
-        weight=jnp.zeros(shape, _STORED),
-        surface=Surface(
-            mean=jnp.zeros((*shape, 3), _STORED),
-            axes=jnp.zeros((*shape, 3, 3), _STORED),
-            nearest=jnp.full((*shape, 3), distance.NO_FEATURE, jnp.int8),
-            sdf=jnp.full(shape, config.distance_horizon, _STORED),
-            doubt=jnp.full(shape, config.distance_horizon, _STORED),
-            frontier=jnp.full(shape, -geometry.FRONTIER_STEPS, jnp.int8),
-        ),
-    )
-
-
-def _widen(grid: Grid) -> Grid:
-    """What the rays counted, in float32: one cloud may add more than float16 holds."""
-    return grid.replace(
-        hits=grid.hits.astype(jnp.float32),
-        passes=grid.passes.astype(jnp.float32),
-        behind=grid.behind.astype(jnp.float32),
-        weight=grid.weight.astype(jnp.float32) ** 2,
-    )
-
-
-def _narrow(grid: Grid) -> Grid:
-    """The inverse; weights as their roots, since those of far returns are very small."""
-    return grid.replace(
-        hits=grid.hits.astype(_STORED),
-        passes=grid.passes.astype(_STORED),
-        behind=grid.behind.astype(_STORED),
-        weight=jnp.sqrt(grid.weight).astype(_STORED),
-    )
 
 
 def _check_shapes(cloud: Any, pose: Any) -> None:

@@ -13,7 +13,7 @@ from room import BOUNDS, CONFIG, HALF, room_cloud, room_sdf, stream
 
 import hiosdf_jax as hio
 from hiosdf_jax import mapping
-from hiosdf_jax.grid import geometry, surface
+from hiosdf_jax.grid import evidence, geometry, surface
 
 
 def arrays_equal(a, b):
@@ -379,13 +379,15 @@ def test_far_returns_are_averaged_like_near_ones():
     config = dataclasses.replace(
         CONFIG, bounds=((28, -1, -1), (31, 1, 1)), max_range=40.0, range_noise=(0.001, 0.01)
     )
-    grid = mapping._empty_grid(config)
+    grid, sensor = evidence.empty_grid(config), jnp.zeros(3)
     offsets = np.random.default_rng(0).uniform(-0.04, 0.04, 40)
-    fuse = jax.jit(
-        lambda grid, points: mapping._narrow(
-            surface.fuse_hits(config, mapping._widen(grid), points, jnp.ones(1, bool), jnp.zeros(3))
-        )
-    )
+
+    @jax.jit
+    def fuse(grid, points):
+        start, window = evidence.read_evidence(config, grid, sensor)
+        window = surface.fuse_hits(config, window, start, points, jnp.ones(1, bool), sensor)
+        return evidence.write_evidence(grid, start, window)
+
     for offset in offsets:
         grid = fuse(grid, jnp.asarray([[30.05 + offset, 0.05, 0.05]], jnp.float32))
     index, _, _ = geometry.voxel_of(config, jnp.asarray([[30.05, 0.05, 0.05]]))

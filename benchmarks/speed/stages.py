@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax import mapping, uncertainty
-from hiosdf_jax.grid import distance, frontier, rays, sampling, surface
+from hiosdf_jax.grid import distance, evidence, frontier, rays, sampling, surface
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
@@ -52,9 +52,8 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         stages[name] = Stage(name, compiled, arguments, result)
         return result
 
-    def fade(grid: Any, sensor_world: jax.Array) -> Any:
-        grid = rays.fade_evidence(config, grid, sensor_world)
-        return mapping._narrow(grid)
+    def fade(grid: Any, start: jax.Array, window: Any) -> Any:
+        return evidence.write_evidence(grid, start, rays.fade_evidence(config, window))
 
     stage(
         "calibration",
@@ -65,26 +64,30 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         sensor_world,
         check_key,
     )
-    grid = mapping._widen(state.grid)
-    grid = stage(
+    start, window = stage(
+        "window", partial(evidence.read_evidence, config), state.grid, sensor_world
+    )
+    window = stage(
         "fusion",
         partial(surface.fuse_hits, config),
-        grid,
+        window,
+        start,
         beams.points_world,
         beams.ends,
         sensor_world,
     )
-    grid = stage(
+    window = stage(
         "rays",
         partial(rays.trace_rays, config),
-        grid,
+        window,
+        start,
         beams.directions_world,
         beams.free_ranges,
         beams.in_range,
         beams.ends,
         sensor_world,
     )
-    grid = stage("fading", fade, grid, sensor_world)
+    grid = stage("fading", fade, state.grid, start, window)
     grid = stage(
         "distance",
         partial(distance.update_distances, config),

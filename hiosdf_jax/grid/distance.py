@@ -6,6 +6,8 @@ squared distance; the sites lie at their patch's centre, not at their voxel's.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -35,46 +37,62 @@ _TILE_VOXELS = 1 << 17
 _CHUNK = 8
 
 
-def nearest_sites(sites: jax.Array, offset: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
+class Part(NamedTuple):
+    """A box of voxels in an array.
+
+    Attributes:
+        start: Its first voxel, three int32 scalars.
+        shape: Static.
+    """
+
+    start: tuple[jax.Array | int, ...]
+    shape: tuple[int, ...]
+
+
+def nearest_sites(
+    sites: jax.Array, offset: jax.Array, horizon: int, part: Part | None = None
+) -> tuple[jax.Array, jax.Array]:
     """Finds each voxel's nearest site by exact passes over the axes.
 
     Args:
         sites: (X, Y, Z) bool, the voxels that hold a site.
         offset: (X, Y, Z, 3) of the site from its voxel's centre, voxels, in [-0.5, 0.5].
         horizon: Sites farther than this along an axis are not looked for, voxels.
+        part: The voxels to find them for; by default all.
 
     Returns:
-        nearest: (X, Y, Z) int32, the flat index of the nearest site's voxel; -1 where none is
-            within the horizon.
-        squared: (X, Y, Z) squared distance of the voxel's centre to it, voxels^2.
+        nearest: (A, B, C) int32, the flat index of the nearest site's voxel; -1 where none is
+            within the horizon. Of the part's shape.
+        squared: (A, B, C) squared distance of the voxel's centre to it, voxels^2.
     """
-    shape = sites.shape
-    position = jnp.arange(sites.size, dtype=jnp.int32).reshape(shape)
-    nearest = position
+    start, shape = part or Part((0, 0, 0), sites.shape)
+    nearest = jnp.arange(sites.size, dtype=jnp.int32).reshape(sites.shape)
     squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
     # Short axes first: after a floor and a ceiling are known, the others need few shifts.
-    for count, axis in enumerate(sorted(range(3), key=lambda k: shape[k])):
-        stride = [shape[1] * shape[2], shape[2], 1][axis]
-        along = offset[..., axis]
-        if count > 0:  # each voxel's candidate is no longer its own site
-            along = along.ravel()[nearest.ravel()].reshape(shape)
-        squared, shift = _pass(squared, along, axis, horizon)
-        candidate = position + shift * stride
-        nearest = candidate if count == 0 else nearest.ravel()[candidate]
+    for axis in sorted(range(3), key=lambda k: sites.shape[k]):
+        # A voxel's candidate lies at some other place along this axis.
+        along = offset[..., axis].ravel()[nearest.ravel()].reshape(nearest.shape)
+        squared, shift = _pass(squared, along, axis, horizon, start[axis], shape[axis])
+        row = jax.lax.broadcasted_iota(jnp.int32, shift.shape, axis) + start[axis] + shift
+        nearest = jnp.take_along_axis(nearest, row, axis)
     found = squared <= horizon**2
     return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
 
 
 def _pass(
-    squared: jax.Array, along: jax.Array, axis: int, horizon: int
+    squared: jax.Array,
+    along: jax.Array,
+    axis: int,
+    horizon: int,
+    first: jax.Array | int,
+    length: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Least distance over shifts of the candidates along an axis.
+    """Least distance over shifts of the candidates along an axis, for `length` voxels of it.
 
     The candidate of a voxel k further on is at k + along from here, and its distance across the
     axis is the same as there.
     """
-    length = squared.shape[axis]
-    reach = min(horizon + 1, length - 1)
+    reach = min(horizon + 1, squared.shape[axis] - 1)
     chunks = -(-reach // _CHUNK)
     margin = [(0, 0)] * 3
     margin[axis] = (chunks * _CHUNK, chunks * _CHUNK)
@@ -82,7 +100,7 @@ def _pass(
     along = jnp.pad(along, margin)
 
     def better(best: jax.Array, shift: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        start = chunks * _CHUNK + k
+        start = first + chunks * _CHUNK + k
         there = jax.lax.dynamic_slice_in_dim(along, start, length, axis)
         candidate = jax.lax.dynamic_slice_in_dim(across, start, length, axis) + (k + there) ** 2
         return jnp.minimum(best, candidate), jnp.where(candidate < best, k, shift)
@@ -102,7 +120,8 @@ def _pass(
                 best, shift = better(best, shift, sign * (chunk * _CHUNK + k))
         return chunk + 1, best, shift
 
-    start = (jnp.int32(0), squared, jnp.zeros(squared.shape, jnp.int32))
+    best = jax.lax.dynamic_slice_in_dim(squared, first, length, axis)
+    start = (jnp.int32(0), best, jnp.zeros(best.shape, jnp.int32))
     _, best, shift = jax.lax.while_loop(more, step, start)
     return best, shift
 
@@ -136,24 +155,28 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
         )
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
+    inner = geometry.window_shape(config, changed)
+    inner_start = geometry.window_start(config, inner, sensor_world)
+    within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
+    part = Part(within, inner)
     features = surface.is_feature(config, hits, passes, axes)
-    nearest, _ = nearest_sites(features, mean, config.horizon_voxels)
+    nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part)
     nearest = nearest.ravel()
-    _, squared = nearest_sites(surface.is_doubtful(hits, passes), mean, config.horizon_voxels)
+    doubtful = surface.is_doubtful(hits, passes)
+    _, squared = nearest_sites(doubtful, mean, config.horizon_voxels, part)
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
     free = is_free(passes, behind)
     flat_mean, flat_axes = mean.reshape(-1, 3), axes.reshape(-1, 3, 3)
-    flat_behind = behind.ravel()
 
     def place(voxel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Jump to the nearest patch and signed distance to it, of one voxel of the window."""
-        here = jnp.stack(jnp.unravel_index(voxel, shape))
+        """Jump to the nearest patch and signed distance to it, of one voxel of the part."""
+        here = jnp.stack(jnp.unravel_index(voxel, inner)) + jnp.stack(within)
         row = jnp.maximum(nearest[voxel], 0)
         jump = jnp.stack(jnp.unravel_index(row, shape)) - here
         patch_axes = flat_axes[row].astype(jnp.float32)
         offset = surface.patch_offset(jnp.zeros(3, jnp.float32), flat_mean[row] + jump, patch_axes)
         distance = surface.safe_norm(offset)
-        side = _side(free, flat_behind[voxel], here, offset, distance, patch_axes)
+        side = _side(free, behind, here, offset, distance, patch_axes)
         found = nearest[voxel] >= 0
         sdf = jnp.where(found, side * distance * config.voxel_size, config.distance_horizon)
         return jnp.where(found, jump, NO_FEATURE).astype(jnp.int8), sdf
@@ -161,15 +184,10 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
     # In tiles: the patches of all voxels at once would take many times the map's memory.
     tile = min(_TILE_VOXELS, nearest.size)
     jump, sdf = jax.lax.map(place, jnp.arange(nearest.size, dtype=jnp.int32), batch_size=tile)
-    jump, sdf = jump.reshape(*shape, 3), sdf.reshape(shape)
 
-    inner = geometry.window_shape(config, changed)
-    inner_start = geometry.window_start(config, inner, sensor_world)
-    within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
-
-    def put(old: jax.Array, window: jax.Array) -> jax.Array:
-        new = geometry.read_window(window, within, inner).astype(old.dtype)
-        return geometry.write_window(old, inner_start, new)
+    def put(old: jax.Array, values: jax.Array) -> jax.Array:
+        values = values.reshape(*inner, *old.shape[3:]).astype(old.dtype)
+        return geometry.write_window(old, inner_start, values)
 
     known = grid.surface
     return grid.replace(
@@ -210,7 +228,7 @@ def _side(
 
     Args:
         free: (X, Y, Z) bool, what `is_free` says of the window.
-        behind: () rays that ended a little before the voxel.
+        behind: (X, Y, Z) rays that ended a little before the window's voxels.
         here: (3,) index of the voxel in the window.
         offset: (3,) from the nearest point of the nearest patch to the centre, voxels.
         distance: () its length.
@@ -228,6 +246,6 @@ def _side(
     sheet = free[probe[0], probe[1], probe[2]]
     by_plane = in_front | sheet
     unmet = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
-    by_rays = jnp.where(behind > 0, -1.0, unmet)
+    by_rays = jnp.where(behind[here[0], here[1], here[2]] > 0, -1.0, unmet)
     by_rays = jnp.where(free[here[0], here[1], here[2]], 1.0, by_rays)
     return jnp.where(flat & (distance < 1), jnp.where(by_plane, 1.0, -1.0), by_rays)

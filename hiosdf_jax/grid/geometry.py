@@ -48,6 +48,26 @@ def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Ar
     return jnp.nan_to_num(cell).astype(jnp.int32), offset, inside
 
 
+def voxel_of_window(
+    config: Config, start: jax.Array, shape: tuple[int, ...], points_world: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds the voxels of a part of the grid that contain points.
+
+    Args:
+        config: The map's configuration.
+        start: (3,) int32, the part's first voxel.
+        shape: Its shape.
+        points_world: (..., 3) m.
+
+    Returns:
+        As `voxel_of`, for that part; indices of points outside of it mean nothing.
+    """
+    index, offset, inside = voxel_of(config, points_world)
+    index = index - start
+    within = jnp.all((index >= 0) & (index < jnp.asarray(shape, jnp.int32)), axis=-1)
+    return index, offset, inside & within
+
+
 def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     """Finds the centres of voxels.
 

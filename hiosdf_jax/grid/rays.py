@@ -21,13 +21,17 @@ _MARGIN_VOXELS = 1.0
 # Hidden space is marked from half a voxel behind the end of a ray, in as many steps of one voxel.
 _BEHIND_STEPS = 3
 
+HIDDEN_VOXELS = _BEHIND_STEPS + 1
+"""Rays change nothing farther behind their ends."""
+
 # Steps a loop iteration makes: fewer, larger kernels.
 _CHUNK = 8
 
 
 def trace_rays(
     config: Config,
-    grid: Grid,
+    window: Grid,
+    start: jax.Array,
     directions_world: jax.Array,
     ranges: jax.Array,
     valid: jax.Array,
@@ -38,7 +42,8 @@ def trace_rays(
 
     Args:
         config: The map's configuration.
-        grid: The grid.
+        window: The grid, or a part of it.
+        start: (3,) int32, that part's first voxel.
         directions_world: (N, 3) unit vectors from the sensor.
         ranges: (N,) length of the ray that is known to be free, m; it ends there if `ends`.
         valid: (N,) bool; other rows change nothing.
@@ -46,9 +51,9 @@ def trace_rays(
         sensor_world: (3,) m.
 
     Returns:
-        The grid with new passes and behind.
+        The window with new passes and behind.
     """
-    shape = config.grid_shape
+    shape = window.passes.shape
     voxels = shape[0] * shape[1] * shape[2]
     size = config.voxel_size
     phase = _phases(ranges.shape[0])
@@ -56,7 +61,7 @@ def trace_rays(
     def count(array: jax.Array, steps: jax.Array, counted: jax.Array) -> jax.Array:
         """Adds 1 for each (N, K) step, in voxels along the ray, that is counted."""
         points = sensor_world + (steps * size)[..., None] * directions_world[:, None, :]
-        index, _, inside = geometry.voxel_of(config, points)
+        index, _, inside = geometry.voxel_of_window(config, start, shape, points)
         voxel = jnp.where(counted & inside, geometry.flat_index(shape, index), voxels)
         return array.at[voxel.ravel()].add(1, mode="drop")
 
@@ -69,7 +74,7 @@ def trace_rays(
         return done + _CHUNK, count(passes, steps, steps < free[:, None])
 
     _, passes = jax.lax.while_loop(
-        lambda carry: carry[0] < longest, advance, (jnp.float32(0), grid.passes.ravel())
+        lambda carry: carry[0] < longest, advance, (jnp.float32(0), window.passes.ravel())
     )
     steps = (
         (ranges / size)[:, None]
@@ -78,37 +83,29 @@ def trace_rays(
         + phase[:, None]
     )
     hidden = jnp.broadcast_to((valid & ends)[:, None], steps.shape)
-    behind = count(grid.behind.ravel(), steps, hidden)
-    return grid.replace(passes=passes.reshape(shape), behind=behind.reshape(shape))
+    behind = count(window.behind.ravel(), steps, hidden)
+    return window.replace(passes=passes.reshape(shape), behind=behind.reshape(shape))
 
 
-def fade_evidence(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid:
+def fade_evidence(config: Config, window: Grid) -> Grid:
     """Lets old evidence fade so that a voxel remembers `evidence_limit` rays.
 
     That bounds how long a surface that has vanished, or appeared, has to be seen to be believed.
 
     Args:
         config: The map's configuration.
-        grid: The grid, with new evidence within max_range of the sensor.
-        sensor_world: (3,) m.
+        window: The grid, or the part of it that has new evidence.
 
     Returns:
-        The grid with scaled hits, weight, passes and behind.
+        The window with scaled hits, weight, passes and behind.
     """
-    hidden = (_BEHIND_STEPS + 1) * config.voxel_size
-    shape = geometry.window_shape(config, config.max_range + hidden)
-    start = geometry.window_start(config, shape, sensor_world)
-    hits, weight, passes, behind = (
-        geometry.read_window(array, start, shape)
-        for array in (grid.hits, grid.weight, grid.passes, grid.behind)
-    )
-    scale = jnp.minimum(1, config.evidence_limit / jnp.maximum(hits + passes, 1))
-    behind = jnp.minimum(behind, config.evidence_limit)
-    return grid.replace(
-        hits=geometry.write_window(grid.hits, start, hits * scale),
-        weight=geometry.write_window(grid.weight, start, weight * scale),
-        passes=geometry.write_window(grid.passes, start, passes * scale),
-        behind=geometry.write_window(grid.behind, start, behind),
+    rays = window.hits + window.passes
+    scale = jnp.minimum(1, config.evidence_limit / jnp.maximum(rays, 1))
+    return window.replace(
+        hits=window.hits * scale,
+        weight=window.weight * scale,
+        passes=window.passes * scale,
+        behind=jnp.minimum(window.behind, config.evidence_limit),
     )
 
 

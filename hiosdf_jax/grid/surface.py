@@ -34,7 +34,8 @@ _DOUBT_RATIO = 0.02
 
 def fuse_hits(
     config: Config,
-    grid: Grid,
+    window: Grid,
+    start: jax.Array,
     points_world: jax.Array,
     valid: jax.Array,
     sensor_world: jax.Array,
@@ -43,18 +44,19 @@ def fuse_hits(
 
     Args:
         config: The map's configuration.
-        grid: The grid.
+        window: The grid, or a part of it.
+        start: (3,) int32, that part's first voxel.
         points_world: (N, 3) m.
         valid: (N,) bool; other rows change nothing.
         sensor_world: (3,) m.
 
     Returns:
-        The grid with new hits, weight, mean and axes.
+        The window with new hits, weight, mean and axes.
     """
     count = points_world.shape[0]
-    shape = config.grid_shape
+    shape = window.hits.shape
     voxels = shape[0] * shape[1] * shape[2]
-    index, offset, inside = geometry.voxel_of(config, points_world)
+    index, offset, inside = geometry.voxel_of_window(config, start, shape, points_world)
     voxel = jnp.where(valid & inside, geometry.flat_index(shape, index), voxels)
 
     # Rows of one voxel become neighbours, so that sums cost the cloud's size, not the grid's.
@@ -83,7 +85,7 @@ def fuse_hits(
     # Chan's rule merges the two means and covariances.
     old_hits, old_weight, old_mean, old_axes = (
         array.reshape(voxels, *array.shape[3:])[jnp.minimum(target, voxels - 1)].astype(jnp.float32)
-        for array in (grid.hits, grid.weight, grid.surface.mean, grid.surface.axes)
+        for array in (window.hits, window.weight, window.surface.mean, window.surface.axes)
     )
     old_spread = jnp.einsum("nki,nkj->nij", old_axes, old_axes)
     part = new_weight / jnp.maximum(old_weight + new_weight, 1e-30)
@@ -96,7 +98,7 @@ def fuse_hits(
     )
     deviation, direction = principal_axes(spread)
     target_index = jnp.stack(jnp.unravel_index(jnp.minimum(target, voxels - 1), shape), axis=-1)
-    center_world = geometry.voxel_center(config, target_index)
+    center_world = geometry.voxel_center(config, start + target_index)
     to_sensor = (sensor_world - center_world) / config.voxel_size - mean
     faces_away = jnp.sum(direction[:, 2] * to_sensor, axis=-1) < 0
     direction = direction.at[:, 2].multiply(jnp.where(faces_away, -1.0, 1.0)[:, None])
@@ -106,11 +108,11 @@ def fuse_hits(
         flat = array.reshape(voxels, *array.shape[3:])
         return flat.at[target].set(values.astype(array.dtype), mode="drop").reshape(array.shape)
 
-    return grid.replace(
-        hits=put(grid.hits, old_hits + new_hits),
-        weight=put(grid.weight, old_weight + new_weight),
-        surface=grid.surface.replace(
-            mean=put(grid.surface.mean, mean), axes=put(grid.surface.axes, axes)
+    return window.replace(
+        hits=put(window.hits, old_hits + new_hits),
+        weight=put(window.weight, old_weight + new_weight),
+        surface=window.surface.replace(
+            mean=put(window.surface.mean, mean), axes=put(window.surface.axes, axes)
         ),
     )
 
