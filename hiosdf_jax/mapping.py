@@ -14,6 +14,7 @@ import numpy as np
 from hiosdf_jax import uncertainty
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import distance, evidence, frontier, geometry, rays, sampling, surface
+from hiosdf_jax.grid.change import Change, change_by
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
@@ -181,8 +182,8 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     )
     window = rays.fade_evidence(config, window)
     grid = evidence.write_evidence(state.grid, start, window)
-    grid = distance.update_distances(config, grid, sensor_world)
-    grid = frontier.update_frontier(config, grid, sensor_world)
+    grid = distance.update_distances(config, grid, beams.change)
+    grid = frontier.update_frontier(config, grid, beams.change)
 
     # What the network learns from (IV-B, IV-C), and its fit (IV-D).
     samples = concatenate(
@@ -233,6 +234,7 @@ class Beams(NamedTuple):
         ends: (N,) bool, and not farther than max_range: those tell of a surface.
         inside: (N,) bool, end in the bounds.
         sensor_world: (3,) m, where they begin.
+        change: What they can change.
     """
 
     points_world: jax.Array
@@ -242,6 +244,7 @@ class Beams(NamedTuple):
     ends: jax.Array
     inside: jax.Array
     sensor_world: jax.Array
+    change: Change
 
 
 def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Beams:
@@ -263,14 +266,18 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
     offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
     points_world = sensor_world + offsets_world
     _, _, inside = geometry.voxel_of(config, points_world)
+    directions_world = offsets_world / jnp.maximum(ranges, 1e-6)[:, None]
+    free_ranges = jnp.minimum(ranges, config.max_range)
+    ends_world = sensor_world + free_ranges[:, None] * directions_world
     return Beams(
         points_world=points_world,
-        directions_world=offsets_world / jnp.maximum(ranges, 1e-6)[:, None],
-        free_ranges=jnp.minimum(ranges, config.max_range),
+        directions_world=directions_world,
+        free_ranges=free_ranges,
         in_range=in_range,
         ends=in_range & (ranges <= config.max_range),
         inside=inside,
         sensor_world=sensor_world,
+        change=change_by(ends_world, in_range, sensor_world),
     )
 
 

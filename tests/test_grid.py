@@ -12,7 +12,17 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 import hiosdf_jax as hio
-from hiosdf_jax.grid import distance, evidence, frontier, geometry, lookup, rays, sampling, surface
+from hiosdf_jax.grid import (
+    change,
+    distance,
+    evidence,
+    frontier,
+    geometry,
+    lookup,
+    rays,
+    sampling,
+    surface,
+)
 from hiosdf_jax.samples import draw_from_mask
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
@@ -32,10 +42,12 @@ update_frontier = jax.jit(frontier.update_frontier, static_argnums=0)
 
 def empty_grid(config=CONFIG):
     """As stages see it: what the rays counted in float32."""
-    return jax.tree.map(
-        lambda array: array.astype(jnp.float32) if array.dtype == jnp.float16 else array,
-        evidence.empty_grid(config),
-    )
+    grid = evidence.empty_grid(config)
+    counts = {
+        name: getattr(grid, name).astype(jnp.float32)
+        for name in ("hits", "passes", "behind", "weight")
+    }
+    return grid.replace(**counts)
 
 
 def uniform(seed, count, low=BOUNDS[0], high=BOUNDS[1]):
@@ -45,6 +57,12 @@ def uniform(seed, count, low=BOUNDS[0], high=BOUNDS[1]):
 def fuse(grid, points, sensor=(0.3, 0.5, 0.6), valid=None, config=CONFIG):
     valid = np.ones(len(points), bool) if valid is None else valid
     return fuse_hits(config, grid, FIRST, jnp.asarray(points), valid, jnp.asarray(sensor))
+
+
+def everywhere(sensor):
+    """The change by a cloud that may have gone anywhere within range."""
+    sensor = jnp.asarray(sensor, jnp.float32)
+    return change.Change(sensor, sensor - 100, sensor + 100)
 
 
 def same(a, b):
@@ -363,7 +381,7 @@ def wall_room(config, seeds=range(4), half=(0.47, 0.38, 0.29), center=(0.3, 0.5,
         grid = trace(
             fuse(grid, ends.astype(np.float32), sensor, config=config), ends, sensor, config=config
         )
-        grid = update_distances(config, grid, jnp.asarray(sensor, jnp.float32))
+        grid = update_distances(config, grid, everywhere(sensor))
     return grid
 
 
@@ -423,7 +441,7 @@ def test_a_sheet_seen_from_both_sides_is_free_on_both():
         sensor = np.array([0.3 + side * 0.4, 0.5, 0.6])
         ends = uniform(13, 3000, (0.36, 0.1, 0.3), (0.36001, 0.9, 0.9))
         grid = trace(fuse(grid, ends, sensor), ends, sensor)
-    grid = update_distances(CONFIG, grid, jnp.array([0.3, 0.5, 0.6]))
+    grid = update_distances(CONFIG, grid, everywhere((0.3, 0.5, 0.6)))
     points = uniform(14, 300, (0.2, 0.3, 0.45), (0.52, 0.7, 0.75))
     value = np.asarray(lookup.grid_sdf(CONFIG, grid.surface, points))
     assert np.mean(value >= 0) > 0.99
@@ -434,27 +452,33 @@ def test_a_sheet_seen_from_both_sides_is_free_on_both():
 
 
 def test_a_window_gives_what_a_full_recomputation_gives():
-    bounds = ((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
+    bounds = ((0.0, 0.0, 0.0), (6.0, 1.0, 1.0))
     small = dataclasses.replace(
         CONFIG, bounds=bounds, max_range=0.5, distance_horizon=0.6, frontier_horizon=0.4
     )
     large = dataclasses.replace(small, max_range=50.0)
-    assert geometry.window_shape(small, 2.0)[0] == 40
-    assert geometry.window_shape(small, 1.8)[0] < 40
-    grids = [empty_grid(small), empty_grid(large)]
-    for x in (0.5, 2.0, 3.3, 2.2, 0.9):
+    grids, fits = [empty_grid(small), empty_grid(large), empty_grid(small)], set()
+    for x, spread in ((0.5, 0.2), (2.0, 0.25), (3.3, 0.35), (2.2, 0.1), (0.9, 0.15)):
         sensor = np.array([x, 0.5, 0.5])
-        ends = sensor + uniform(int(10 * x), 60, (-0.25,) * 3, (0.25,) * 3)
-        for k, config in enumerate((small, large)):
-            grid = trace(
-                fuse(grids[k], ends.astype(np.float32), sensor, config=config),
-                ends,
-                sensor,
-                config=config,
-            )
-            grid = update_distances(config, grid, jnp.asarray(sensor, jnp.float32))
-            grids[k] = update_frontier(config, grid, jnp.asarray(sensor, jnp.float32))
+        ends = sensor + uniform(int(10 * x), 60, (-spread,) * 3, (spread,) * 3)
+        ends[:, 0] += 0.1
+        ends = ends.astype(np.float32)
+        box = change.change_by(
+            jnp.asarray(ends), jnp.ones(60, bool), jnp.asarray(sensor, jnp.float32)
+        )
+        fits.add(bool(jnp.max(box.high_world - box.low_world) <= 0.5))
+        boxes = (everywhere(sensor), everywhere(sensor), box)
+        for k, config in enumerate((small, large, small)):
+            grid = fuse(grids[k], ends, sensor, config=config)
+            grid = trace(grid, ends, sensor, config=config)
+            grid = update_distances(config, grid, boxes[k])
+            grids[k] = update_frontier(config, grid, boxes[k])
+    assert fits == {True, False}
+    # The windows: of a small change, of any, of all.
+    reaches = (0.25 + 0.4 + 1.2 + 0.1, 0.5 + 0.4 + 1.2 + 0.1, 100.0)
+    assert [geometry.window_shape(small, reach)[0] for reach in reaches] == [41, 45, 60]
     assert same(grids[0].surface, grids[1].surface)
+    assert same(grids[2].surface, grids[1].surface)
 
 
 def test_an_empty_grid_answers_the_horizon():

@@ -92,13 +92,13 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         "distance",
         partial(distance.update_distances, config),
         grid,
-        sensor_world,
+        beams.change,
     )
     grid = stage(
         "frontier",
         partial(frontier.update_frontier, config),
         grid,
-        sensor_world,
+        beams.change,
     )
     global_samples = stage(
         "grid samples",

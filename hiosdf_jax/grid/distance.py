@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, surface
-from hiosdf_jax.state import Grid
+from hiosdf_jax.grid.change import Change, recompute
+from hiosdf_jax.state import Grid, Surface
 
 NO_FEATURE = -128
 """`Grid.nearest` where there is no feature within the horizon."""
@@ -126,24 +127,35 @@ def _pass(
     return best, shift
 
 
-def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid:
-    """Recomputes distances and signs where evidence near a sensor can have changed them.
-
-    A voxel changes only within max_range + horizon of the sensor, and the features that decide on
-    it lie within the horizon of it: the window read is that much larger than the part written.
+def update_distances(config: Config, grid: Grid, change: Change) -> Grid:
+    """Recomputes distances and signs where new evidence can have changed them.
 
     Args:
         config: The map's configuration.
-        grid: The grid, with new evidence within max_range of the sensor.
-        sensor_world: (3,) m.
+        grid: The grid, with new evidence.
+        change: Where that is.
 
     Returns:
         The grid with nearest, sdf and doubt as if recomputed everywhere.
     """
     horizon_m = config.horizon_voxels * config.voxel_size
-    changed = config.max_range + horizon_m + config.voxel_size
+
+    def around(center_world: jax.Array, reach: float) -> Surface:
+        return _distances_around(config, grid, center_world, reach)
+
+    return grid.replace(surface=recompute(config, change, 2 * horizon_m, around))
+
+
+def _distances_around(config: Config, grid: Grid, center_world: jax.Array, reach: float) -> Surface:
+    """The same, for evidence within `reach` metres of a point along the axes.
+
+    A voxel changes only within reach + horizon of it, and the features that decide on a voxel lie
+    within the horizon: the window read is that much larger than the part written.
+    """
+    horizon_m = config.horizon_voxels * config.voxel_size
+    changed = reach + horizon_m + config.voxel_size
     shape = geometry.window_shape(config, changed + horizon_m)
-    start = geometry.window_start(config, shape, sensor_world)
+    start = geometry.window_start(config, shape, center_world)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)
         for array in (
@@ -156,7 +168,7 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
     inner = geometry.window_shape(config, changed)
-    inner_start = geometry.window_start(config, inner, sensor_world)
+    inner_start = geometry.window_start(config, inner, center_world)
     within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
     part = Part(within, inner)
     features = surface.is_feature(config, hits, passes, axes)
@@ -190,12 +202,8 @@ def update_distances(config: Config, grid: Grid, sensor_world: jax.Array) -> Gri
         return geometry.write_window(old, inner_start, values)
 
     known = grid.surface
-    return grid.replace(
-        surface=known.replace(
-            nearest=put(known.nearest, jump),
-            sdf=put(known.sdf, sdf),
-            doubt=put(known.doubt, doubt),
-        )
+    return known.replace(
+        nearest=put(known.nearest, jump), sdf=put(known.sdf, sdf), doubt=put(known.doubt, doubt)
     )
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, lookup
+from hiosdf_jax.grid.change import Change, recompute
 from hiosdf_jax.state import Grid
 
 _INFINITE = 1e12  # squared voxels
@@ -54,22 +55,35 @@ def _pass(inside: jax.Array, squared: jax.Array, axis: int, reach: int) -> jax.A
     return best
 
 
-def update_frontier(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid:
-    """Recomputes the distances to unseen space where a sensor can have seen something new.
+def update_frontier(config: Config, grid: Grid, change: Change) -> Grid:
+    """Recomputes the distances to unseen space where something new can have been seen.
 
     Args:
         config: The map's configuration.
-        grid: The grid, with new evidence within max_range of the sensor.
-        sensor_world: (3,) m.
+        grid: The grid, with new evidence.
+        change: Where that is.
 
     Returns:
         The grid with its frontier as if recomputed everywhere. What lies beyond the bounds has
         not been seen.
     """
     horizon_m = config.frontier_voxels * config.voxel_size
-    changed = config.max_range + horizon_m + config.voxel_size
+
+    def around(center_world: jax.Array, reach: float) -> jax.Array:
+        return _frontier_around(config, grid, center_world, reach)
+
+    frontier = recompute(config, change, 2 * horizon_m, around)
+    return grid.replace(surface=grid.surface.replace(frontier=frontier))
+
+
+def _frontier_around(
+    config: Config, grid: Grid, center_world: jax.Array, reach: float
+) -> jax.Array:
+    """The grid's frontier for evidence within `reach` metres of a point along the axes."""
+    horizon_m = config.frontier_voxels * config.voxel_size
+    changed = reach + horizon_m + config.voxel_size
     shape = geometry.window_shape(config, changed + horizon_m)
-    start = geometry.window_start(config, shape, sensor_world)
+    start = geometry.window_start(config, shape, center_world)
     seen = lookup.observed(
         geometry.read_window(grid.passes, start, shape),
         geometry.read_window(grid.hits, start, shape),
@@ -81,7 +95,7 @@ def update_frontier(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid
         distance = jnp.where(seen, jnp.minimum(distance, border), distance)
 
     inner = geometry.window_shape(config, changed)
-    inner_start = geometry.window_start(config, inner, sensor_world)
+    inner_start = geometry.window_start(config, inner, center_world)
     within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
     metres = geometry.read_window(distance * config.voxel_size, within, inner)
     # Rounded down: never farther than it is.
@@ -90,5 +104,4 @@ def update_frontier(config: Config, grid: Grid, sensor_world: jax.Array) -> Grid
         .clip(-geometry.FRONTIER_STEPS, geometry.FRONTIER_STEPS)
         .astype(jnp.int8)
     )
-    frontier = geometry.write_window(grid.surface.frontier, inner_start, steps)
-    return grid.replace(surface=grid.surface.replace(frontier=frontier))
+    return geometry.write_window(grid.surface.frontier, inner_start, steps)

@@ -24,6 +24,9 @@ _BEHIND_STEPS = 3
 HIDDEN_VOXELS = _BEHIND_STEPS + 1
 """Rays change nothing farther behind their ends."""
 
+# Two float16 numbers are at most so much larger than what they were rounded from.
+_ROUNDING = 1.0007
+
 # Steps a loop iteration makes: fewer, larger kernels.
 _CHUNK = 8
 
@@ -100,7 +103,9 @@ def fade_evidence(config: Config, window: Grid) -> Grid:
         The window with scaled hits, weight, passes and behind.
     """
     rays = window.hits + window.passes
-    scale = jnp.minimum(1, config.evidence_limit / jnp.maximum(rays, 1))
+    # What was rounded when it was stored is no new evidence: far from the cloud nothing changes.
+    above = rays > _ROUNDING * config.evidence_limit
+    scale = jnp.where(above, config.evidence_limit / jnp.maximum(rays, 1), 1)
     return window.replace(
         hits=window.hits * scale,
         weight=window.weight * scale,

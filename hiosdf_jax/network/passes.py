@@ -121,8 +121,9 @@ def _dot(x: jax.Array, kernel: jax.Array, dtype: Any) -> jax.Array:
 def _activation(frequency: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     sine, cosine = sine_and_cosine(frequency * z)
     result = sine.astype(stored_dtype()), (frequency * cosine).astype(stored_dtype())
-    # Computed once: XLA would do it again in each of the kernels that read them.
-    return jax.lax.optimization_barrier(result)
+    # Once: for a CPU, XLA would compute them again in each of the kernels that read them.
+    on_cpu = jax.default_backend() == "cpu"
+    return jax.lax.optimization_barrier(result) if on_cpu else result
 
 
 def _activation_forward(frequency: jax.Array, z: jax.Array) -> tuple[Any, Any]:
