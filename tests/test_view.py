@@ -59,7 +59,7 @@ def test_rasteriser_leaves_no_cracks(monkeypatch):
     assert (face >= 0).all()
     np.testing.assert_allclose(depth, 1, atol=1e-6)
     # In many batches as in one.
-    monkeypatch.setattr(shading, "_FRAGMENTS_PER_BATCH", 97)
+    monkeypatch.setattr(shading, "_FACES_PER_BATCH", 97)
     np.testing.assert_array_equal(shading._rasterise(triangles, 100, 100)[1], depth)
 
 

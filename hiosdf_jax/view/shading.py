@@ -21,7 +21,8 @@ _SUPERSAMPLING = 2  # picture elements along each side of a pixel
 _ELEVATION = np.deg2rad(52)  # of the camera: high enough to see over the walls of a room
 _AZIMUTH = np.deg2rad(24)  # off the long side: a view square onto it shows no second wall
 _MARGIN = 0.03  # of the picture, left free on each side
-_FRAGMENTS_PER_BATCH = 1_000_000  # bounds the memory
+_FACES_PER_BATCH = 20_000  # these two bound the memory
+_ROWS_PER_BAND = 64
 _AMBIENT = 0.2
 _LIGHT = np.array([-0.35, 0.7, 0.9])  # towards it: the picture's right, level to the viewer, up
 _PALETTE = np.array(  # by height, from low to high: pale, so that the shading carries the shape
@@ -72,14 +73,13 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     camera = _camera_axes(vertices, up)
     width, height = (_SUPERSAMPLING * side for side in size)
-    image = np.ones((height, width, 3))
 
     a, b, c = vertices[faces.T]
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=-1)
     shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
     if not shown.any():
-        return image[::_SUPERSAMPLING, ::_SUPERSAMPLING]
+        return np.ones((size[1], size[0], 3))
     shown[shown] = ~_remains_of_ceiling(vertices @ up, faces[shown], length[shown])
     normal = normal[shown] / length[shown, None]
     corners = vertices[faces[shown]]  # (F, 3, 3)
@@ -101,15 +101,22 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     brightness = _AMBIENT + (1 - _AMBIENT) * (1 + cosine) / 2
     low, high = np.percentile(corners @ up, [1, 99])
     stops = np.linspace(low, max(high, low + 1e-9), len(_PALETTE))
-    # Back from the picture to metres: the height of what each pixel shows.
-    rows, _ = np.nonzero(covered)
-    level = (middle[1] + ((height - 1) / 2 - rows) / scale) * (camera[1] @ up)
-    level += (upper[2] - depth[covered] / scale) * (camera[2] @ up)
-    tint = np.stack([np.interp(level, stops, channel) for channel in _PALETTE.T], axis=-1)
-    factor = brightness[face[covered]] * _occlusion(depth, covered)[covered]
-    image[covered] = tint * factor[:, None]
-    image = image.reshape(size[1], _SUPERSAMPLING, size[0], _SUPERSAMPLING, 3)
-    return np.clip(image.mean(axis=(1, 3)), 0, 1)
+    shade = _occlusion(depth, covered)
+    image = np.ones((size[1], size[0], 3))
+    for top in range(0, size[1], _ROWS_PER_BAND):
+        band = slice(_SUPERSAMPLING * top, _SUPERSAMPLING * (top + _ROWS_PER_BAND))
+        inside = covered[band]
+        # Back from the picture to metres: the height of what each pixel shows.
+        rows = np.nonzero(inside)[0] + band.start
+        level = (middle[1] + ((height - 1) / 2 - rows) / scale) * (camera[1] @ up)
+        level += (upper[2] - depth[band][inside] / scale) * (camera[2] @ up)
+        factor = brightness[face[band][inside]] * shade[band][inside]
+        fine = np.ones((*inside.shape, 3))
+        for k, channel in enumerate(_PALETTE.T):
+            fine[inside, k] = np.interp(level, stops, channel) * factor
+        blocks = fine.reshape(-1, _SUPERSAMPLING, size[0], _SUPERSAMPLING, 3)
+        image[top : top + _ROWS_PER_BAND] = blocks.mean(axis=(1, 3))
+    return np.clip(image, 0, 1)
 
 
 def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
@@ -178,6 +185,28 @@ def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray
     origin = corners[:, 0, 2] - np.sum(slope * corners[:, 0, :2], axis=-1)
     near, far = corners[..., 2].min(axis=1), corners[..., 2].max(axis=1)
 
+    for start in range(0, len(corners), _FACES_PER_BATCH):
+        part = slice(start, start + _FACES_PER_BATCH)
+        which, row, column = _fragments(corners[part, :, :2])
+        which += start
+        depth = origin[which] + slope[which, 0] * column + slope[which, 1] * row
+        depth = np.clip(depth, near[which], far[which])  # a face on edge has any slope
+        key = ((depth * steps).astype(np.int64) << 32) | which
+        np.minimum.at(buffer, row * width + column, key)
+    buffer = buffer.reshape(height, width)
+    empty = buffer == nothing
+    return (
+        np.where(empty, -1, buffer & (2**32 - 1)),
+        np.where(empty, np.inf, (buffer >> 32) / steps),
+    )
+
+
+def _fragments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lists the pixels in faces: which face, its row and its column, (n,) each.
+
+    Args:
+        corners: (F, 3, 2); for each corner of each face its column and row.
+    """
     slack = 1e-6  # pixels: neighbours round their common edge differently
     first = np.ceil(corners[..., 1].min(axis=1) - slack).astype(int)
     last = np.floor(corners[..., 1].max(axis=1) + slack).astype(int)
@@ -185,7 +214,7 @@ def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray
     # On each row a face covers what lies between its edges there.
     left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for i in range(3):
-        (x0, y0), (x1, y1) = corners[face, i, :2].T, corners[face, (i + 1) % 3, :2].T
+        (x0, y0), (x1, y1) = corners[face, i].T, corners[face, (i + 1) % 3].T
         level = y1 == y0  # the ends of a level edge belong to the two others
         t = (row - y0) / np.where(level, 1, y1 - y0)
         crosses = ~level & (t >= -slack) & (t <= 1 + slack)
@@ -196,22 +225,8 @@ def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray
     face, row = face[found], row[found]
     left = np.ceil(left[found] - slack).astype(int)
     right = np.floor(right[found] + slack).astype(int)
-
-    batch = np.cumsum(np.maximum(right - left + 1, 0)) // _FRAGMENTS_PER_BATCH
-    for rows in np.split(np.arange(len(row)), np.flatnonzero(np.diff(batch)) + 1):
-        span, column = _ranges(left[rows], right[rows])
-        span = rows[span]
-        which = face[span]
-        depth = origin[which] + slope[which, 0] * column + slope[which, 1] * row[span]
-        depth = np.clip(depth, near[which], far[which])  # a face on edge has any slope
-        key = ((depth * steps).astype(np.int64) << 32) | which
-        np.minimum.at(buffer, row[span] * width + column, key)
-    buffer = buffer.reshape(height, width)
-    empty = buffer == nothing
-    return (
-        np.where(empty, -1, buffer & (2**32 - 1)),
-        np.where(empty, np.inf, (buffer >> 32) / steps),
-    )
+    span, column = _ranges(left, right)
+    return face[span], row[span], column
 
 
 def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -236,7 +251,7 @@ def _occlusion(depth: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """
     from scipy.ndimage import gaussian_filter
 
-    factor = np.ones(depth.shape)
+    factor = np.ones(depth.shape, np.float32)
     known = np.where(covered, depth, 0).astype(np.float32)
     for share in (1 / 300, 1 / 80):
         radius = share * max(depth.shape)
