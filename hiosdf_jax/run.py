@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
 import json
 import math
@@ -148,6 +150,7 @@ def run_stream(
         metrics["held_out"] = _score_held_out(field, mapped.held_out_world)
     print(_summary(metrics))
 
+    _give_back_freed_memory()
     print("drawing slices.png, mesh.ply and mesh.png")
     surface = _extract(field)
     up_world = level_up(surface, mapped.up_world)
@@ -211,6 +214,8 @@ def map_frames(
         start = time.perf_counter()
         state = jax.block_until_ready(mapping.update(state, cloud, pose))
         seconds.append(time.perf_counter() - start)
+        if len(seconds) == 1:
+            _give_back_freed_memory()
         last_frame = i
         path_world.append(pose[:3, 3])
         ups_world.append(_up_of_frame(cloud, pose))
@@ -240,6 +245,12 @@ def map_frames(
         points_used=points_used,
         points_outside=points_outside,
     )
+
+
+def _give_back_freed_memory() -> None:
+    """Hands the system what compiling has freed: 0.5 GB that glibc would keep for the process."""
+    with contextlib.suppress(OSError, AttributeError):  # another libc
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def held_out_frames(count: int) -> range:

@@ -80,7 +80,7 @@ def time_ms(
     seconds: float,
     block: Callable[[Any], Any] = jax.block_until_ready,
 ) -> Spread:
-    """Times a function, warmed up, until `seconds` are over: 3 to 300 times.
+    """Times a function, warmed up, until `seconds` are over: 5 to 300 times.
 
     Args:
         function: Compiled, if it is to be.
@@ -94,7 +94,7 @@ def time_ms(
     for _ in range(2):
         block(function(*arguments))
     times, end = [], time.perf_counter() + seconds
-    while len(times) < 3 or (len(times) < 300 and time.perf_counter() < end):
+    while len(times) < 5 or (len(times) < 300 and time.perf_counter() < end):
         start = time.perf_counter()
         block(function(*arguments))
         times.append(1e3 * (time.perf_counter() - start))
