@@ -250,8 +250,8 @@ def stage_rows(bench: Bench, label: str) -> list[Row]:
     cloud, valid, *_ = parts["local samples"].arguments
     queries = np.asarray(parts["local samples"].result.points_world)
     cloud, valid = np.asarray(cloud), np.asarray(valid)
-    grid, sensor_world = parts["distance"].arguments
-    features, doubtful = _sites(config, grid, sensor_world)
+    grid, change = parts["distance"].arguments
+    features, doubtful = _sites(config, grid, change.sensor_world)
     work = {
         "training": limits.training_work(config),
         "distance": limits.distance_work(config),
