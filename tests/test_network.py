@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax.network import siren, tiles, training
+from hiosdf_jax.network import passes, siren, tiles, training
 from hiosdf_jax.network.sine import cosine, sine
 from hiosdf_jax.samples import Samples
 
@@ -179,6 +179,17 @@ def test_a_step_by_tiles_is_a_step(monkeypatch, every):
     if every == 1:  # otherwise the slopes of other samples are taken
         for a, b in zip(jax.tree.leaves(tiled), jax.tree.leaves(whole), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_small_gradients_survive_in_float16(monkeypatch):
+    """As on a GPU: a sample's share of a mean would be lost among the smallest numbers."""
+    config = dataclasses.replace(TINY, sdf_weight=1e-3, eikonal_weight=1e-3)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(900)
+    exact = train(config, network, samples, 1)[0].optimizer[0].mu
+    monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float16)
+    rounded = train(config, network, samples, 1)[0].optimizer[0].mu
+    for a, b in zip(jax.tree.leaves(rounded), jax.tree.leaves(exact), strict=True):
+        assert np.linalg.norm(a - b) < 0.02 * np.linalg.norm(b)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 16, 17, 50])

@@ -67,7 +67,9 @@ def test_lower_is_below_and_by_more_where_grid_and_network_disagree(field):
 
 def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypatch):
     def known(_, points):
-        return points[:, 0] * 0.5, jnp.full(len(points), 0.5)  # a ratio of x
+        return (points[:, 0] + offset) * 0.5, jnp.full(len(points), 0.5)  # a ratio of x + offset
+
+    offset = 1.0
 
     monkeypatch.setattr(served, "cautious_sdf", known)
     points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 3)), jnp.float32)
@@ -78,7 +80,7 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
     area = np.sum((np.asarray(points) - np.asarray(sensor)) ** 2, axis=1)[seen]
     ordered = np.argsort(points[:, 0][seen])
     share = np.cumsum(area[ordered]) / area.sum()
-    expected = float(points[:, 0][seen][ordered][np.argmax(share >= 0.945)])
+    expected = offset + float(points[:, 0][seen][ordered][np.argmax(share >= 0.945)])
     field = field.replace(updates=jnp.int32(0), optimism=jnp.float32(9))
 
     def calibrate(field, ends):
@@ -90,6 +92,43 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
     assert abs(calibrate(later, every) - (0.98 * 9 + 0.02 * expected)) < 0.01
     assert calibrate(field, jnp.asarray(~seen)) == 9
     assert calibrate(field, jnp.zeros(5000, bool)) == 9
+    few = jnp.asarray(seen & (np.cumsum(seen) <= 1))  # drawn 2,000 times: enough, as returns go
+    assert calibrate(field, few) != 9
+    offset = -1.0  # foretold perfectly: free space still needs some
+    assert calibrate(field, every) == pytest.approx(uncertainty._LEAST)
+
+
+def test_too_few_seen_returns_calibrate_nothing(field):
+    known = points_inside(2000)
+    points = np.where(np.arange(2000)[:, None] % 40 == 0, known, 0.999 * np.array(CONFIG.bounds[1]))
+    seen = np.asarray(hio.query(field, points.astype(np.float32)).observed)
+    assert 0 < seen.sum() < 60  # of 2,000 that are drawn with replacement
+    field = field.replace(updates=jnp.int32(0), optimism=jnp.float32(9))
+    sensor = jnp.zeros(3)
+    every = jnp.ones(2000, bool)
+    points = jnp.asarray(points, jnp.float32)
+    assert float(uncertainty.calibrate(field, points, every, sensor, jax.random.key(0))) == 9
+
+
+def test_the_scale_is_of_gap_and_spread(field):
+    points = jnp.asarray(points_inside())
+    rough = field.surface.replace(axes=field.surface.axes.at[..., 2, :].multiply(200.0))
+    field = field.replace(surface=rough)  # the room's walls are smooth
+    nearest = lookup.nearest_patch(CONFIG, field.surface, points)
+    gap = np.abs(served.network_sdf(field, points) - nearest.sdf)
+    _, scale = served.cautious_sdf(field, points)
+    spread = np.asarray(nearest.spread)
+    assert spread.max() > 0.01
+    expected = 0.3 * 0.1 + 0.5 * np.minimum(gap, 0.1) + spread
+    np.testing.assert_allclose(scale, expected, atol=1e-6)
+
+
+def test_beyond_the_bounds_nothing_is_doubtful(field):
+    nothing = jnp.zeros_like(field.surface.doubt)
+    low = np.asarray(CONFIG.bounds[0], np.float32)
+    face = jnp.asarray([[low[0], 0.05, 0.05], [low[0] + 0.05, 0.05, 0.05]])
+    value = lookup.doubt(CONFIG, field.surface.replace(doubt=nothing), face)
+    np.testing.assert_allclose(value, [0.5 * CONFIG.distance_horizon, 0], atol=1e-5)
 
 
 def test_a_carved_surface_still_counts_for_the_lower_bound():

@@ -14,9 +14,6 @@ from hiosdf_jax.network import passes, siren, tiles
 from hiosdf_jax.samples import Samples
 from hiosdf_jax.state import Network
 
-# Of the residuals only as many are looked at: their median is known well enough then.
-_RESIDUALS = 8192
-
 
 class Losses(NamedTuple):
     """The two parts of the loss, before their weights.
@@ -124,10 +121,9 @@ def train(
     served = jax.tree.map(
         lambda old, new: average * old + (1 - average) * new, network.served, params
     )
-    every = max(1, samples.sdf.shape[0] // _RESIDUALS)
-    some = jax.tree.map(lambda array: array[::every], samples)
-    residual = siren.predict(config, served, some.points_world - network.origin_world) - some.sdf
-    served = siren.shift_output(config, served, -_median(residual, some.weight))
+    points = samples.points_world - network.origin_world
+    residual = siren.predict(config, served, points) - samples.sdf
+    served = siren.shift_output(config, served, -_median(residual, samples.weight))
     trained = network.replace(params=params, served=served, optimizer=state)
     kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), trained, network)
     return kept, parts, finite
