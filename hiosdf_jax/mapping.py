@@ -324,11 +324,14 @@ def _to_capacity(cloud: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarr
     rows = np.flatnonzero(_finite_rows(cloud))
     if len(rows) > capacity:
         # The draw must be a function of the arguments alone, and differ from cloud to cloud.
-        seed = zlib.crc32(pose.tobytes(), len(rows))
-        lot = np.random.default_rng(seed).integers(0, 2**32, len(rows), np.uint32)
-        least = np.partition(lot, capacity - 1)[capacity - 1]
-        rows = rows[lot <= least][:capacity]  # equal lots may make them a few more
-    padded[: len(rows)] = cloud.take(rows, axis=0)
+        rng = np.random.default_rng(zlib.crc32(pose.tobytes(), len(rows)))
+        dropped = len(rows) - capacity
+        fewer = min(capacity, dropped)
+        chosen = rng.choice(len(rows), fewer, replace=False, shuffle=False)
+        kept = np.full(len(rows), fewer == dropped)
+        kept[chosen] = fewer != dropped  # chosen are those to drop, or those to keep
+        rows = rows[kept]
+    np.take(cloud, rows, axis=0, out=padded[: len(rows)], mode="clip")
     return padded
 
 
