@@ -68,7 +68,7 @@ class BackgroundMapper:
         """Waits until every frame that was handed over is fused or dropped.
 
         Returns:
-            The map.
+            The map. It shares memory with `field`: do not donate it while that is in use.
 
         Raises:
             RuntimeError: The mapper's thread has failed.
@@ -81,7 +81,7 @@ class BackgroundMapper:
             return self._state
 
     def close(self) -> MapState:
-        """Fuses what waits, ends the thread and returns the map.
+        """Fuses what waits, ends the thread and returns the map, as `wait`.
 
         Raises:
             RuntimeError: The mapper's thread has failed.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import tempfile
+import uuid
 import zipfile
 import zlib
 from pathlib import Path
@@ -49,15 +49,15 @@ def save(path: str | os.PathLike[str], state: MapState) -> None:
     }
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(_without_key(state)).items()}
     arrays["header"] = np.asarray(json.dumps(header))
-    handle, aside = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
+    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with aside.open("xb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
         os.replace(aside, path)
     except BaseException:
-        os.unlink(aside)
+        aside.unlink(missing_ok=True)
         raise
 
 

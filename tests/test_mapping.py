@@ -287,6 +287,13 @@ def test_save_load_and_go_on_is_bit_identical(mapped, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
 
 
+def test_a_saved_file_has_the_rights_of_any_other(mapped, tmp_path):
+    hio.save(tmp_path / "map.npz", mapped)
+    (tmp_path / "other").write_bytes(b"")
+    assert (tmp_path / "map.npz").stat().st_mode == (tmp_path / "other").stat().st_mode
+    assert {path.name for path in tmp_path.iterdir()} == {"map.npz", "other"}
+
+
 def test_a_failed_save_keeps_the_old_file(mapped, tmp_path, monkeypatch):
     path = tmp_path / "map.npz"
     hio.save(path, mapped)
