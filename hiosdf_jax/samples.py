@@ -52,7 +52,7 @@ def draw_from_mask(mask: jax.Array, count: int, key: jax.Array) -> tuple[jax.Arr
     row = jnp.minimum(row, words.size - 1).astype(jnp.int32)
     before = jnp.where(row > 0, rank[row - 1], 0)
     index = _WORD * row + _nth_bit(words[row], chosen - before)
-    return jnp.minimum(index, mask.size - 1), total > 0
+    return jnp.minimum(index, mask.size - 1).astype(jnp.int32), total > 0
 
 
 def _words(mask: jax.Array) -> jax.Array:

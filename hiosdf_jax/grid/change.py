@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, rays
-
-T = TypeVar("T")
 
 # Clouds that fill less than this share of the range in each direction, as those of a camera that
 # looks one way or of a sensor in a small room do, are served by a window that is as much smaller.
@@ -59,7 +57,7 @@ def recompute[T](
     Args:
         config: The map's configuration.
         change: Of the cloud.
-        margin: How much farther than the rays a change reaches, m.
+        margin: How much farther than the rays the function reads, m.
         function: Takes the middle of the change (3,), m, and the reach of its rays from there
             along each axis, m, a static number.
 

@@ -154,7 +154,8 @@ def _distances_around(config: Config, grid: Grid, center_world: jax.Array, reach
     """
     horizon_m = config.horizon_voxels * config.voxel_size
     changed = reach + horizon_m + config.voxel_size
-    shape = geometry.window_shape(config, changed + horizon_m)
+    # Half a voxel more, so that rounding does not take one from the margin around what is written.
+    shape = geometry.window_shape(config, changed + horizon_m + config.voxel_size / 2)
     start = geometry.window_start(config, shape, center_world)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)

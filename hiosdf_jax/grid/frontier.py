@@ -82,7 +82,8 @@ def _frontier_around(
     """The grid's frontier for evidence within `reach` metres of a point along the axes."""
     horizon_m = config.frontier_voxels * config.voxel_size
     changed = reach + horizon_m + config.voxel_size
-    shape = geometry.window_shape(config, changed + horizon_m)
+    # Half a voxel more, so that rounding does not take one from the margin around what is written.
+    shape = geometry.window_shape(config, changed + horizon_m + config.voxel_size / 2)
     start = geometry.window_start(config, shape, center_world)
     seen = lookup.observed(
         geometry.read_window(grid.passes, start, shape),
