@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.core
@@ -13,8 +13,9 @@ import numpy as np
 
 from hiosdf_jax import uncertainty
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid import distance, evidence, frontier, geometry, rays, sampling, surface
-from hiosdf_jax.grid.change import Change, change_by
+from hiosdf_jax.grid import distance, evidence, frontier, rays, sampling, surface
+from hiosdf_jax.grid.beams import place_cloud
+from hiosdf_jax.grid.change import change_by
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
@@ -170,20 +171,12 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     # The coarse grid (paper, IV-B).
     start, window = evidence.read_evidence(config, state.grid, sensor_world)
     window = surface.fuse_hits(config, window, start, beams.points_world, beams.ends, sensor_world)
-    window = rays.trace_rays(
-        config,
-        window,
-        start,
-        beams.directions_world,
-        beams.free_ranges,
-        beams.in_range,
-        beams.ends,
-        sensor_world,
-    )
+    window = rays.trace_rays(config, window, start, beams)
     window = rays.fade_evidence(config, window)
     grid = evidence.write_evidence(state.grid, start, window)
-    grid = distance.update_distances(config, grid, beams.change)
-    grid = frontier.update_frontier(config, grid, beams.change)
+    change = change_by(beams)
+    grid = distance.update_distances(config, grid, change)
+    grid = frontier.update_frontier(config, grid, change)
 
     # What the network learns from (IV-B, IV-C), and its fit (IV-D).
     samples = concatenate(
@@ -220,64 +213,6 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
             eikonal_loss=parts.eikonal,
             flags=flags,
         ),
-    )
-
-
-class Beams(NamedTuple):
-    """A cloud as rays in the world.
-
-    Attributes:
-        points_world: (N, 3) m, where they end.
-        directions_world: (N, 3) unit vectors.
-        free_ranges: (N,) m, the part of them that counts as free.
-        in_range: (N,) bool, not nearer than min_range: those tell of free space.
-        ends: (N,) bool, and not farther than max_range: those tell of a surface.
-        inside: (N,) bool, end in the bounds.
-        sensor_world: (3,) m, where they begin.
-        change: What they can change.
-    """
-
-    points_world: jax.Array
-    directions_world: jax.Array
-    free_ranges: jax.Array
-    in_range: jax.Array
-    ends: jax.Array
-    inside: jax.Array
-    sensor_world: jax.Array
-    change: Change
-
-
-def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Beams:
-    """Takes a cloud to the world.
-
-    Args:
-        config: The map's configuration.
-        cloud: (N, 3) m, sensor frame.
-        finite: (N,) bool; other rows are no returns.
-        pose: (4, 4) T_world_sensor.
-
-    Returns:
-        The rays.
-    """
-    cloud = jnp.where(finite[:, None], cloud, 0)
-    ranges = surface.safe_norm(cloud)
-    in_range = finite & (ranges >= config.min_range)
-    sensor_world = pose[:3, 3]
-    offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
-    points_world = sensor_world + offsets_world
-    _, _, inside = geometry.voxel_of(config, points_world)
-    directions_world = offsets_world / jnp.maximum(ranges, 1e-6)[:, None]
-    free_ranges = jnp.minimum(ranges, config.max_range)
-    ends_world = sensor_world + free_ranges[:, None] * directions_world
-    return Beams(
-        points_world=points_world,
-        directions_world=directions_world,
-        free_ranges=free_ranges,
-        in_range=in_range,
-        ends=in_range & (ranges <= config.max_range),
-        inside=inside,
-        sensor_world=sensor_world,
-        change=change_by(ends_world, in_range, sensor_world),
     )
 
 

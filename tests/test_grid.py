@@ -23,6 +23,7 @@ from hiosdf_jax.grid import (
     sampling,
     surface,
 )
+from hiosdf_jax.grid.beams import Beams
 from hiosdf_jax.samples import draw_from_mask
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
@@ -225,18 +226,21 @@ def test_patch_offset_against_a_dense_rectangle(seed, half):
 
 
 def trace(grid, ends, sensor, hit=True, config=CONFIG):
-    offsets = np.asarray(ends, np.float32) - np.asarray(sensor, np.float32)
-    ranges = np.linalg.norm(offsets, axis=1).astype(np.float32)
-    every = np.ones(len(ranges), bool)
-    return trace_rays(
-        config,
-        grid,
-        FIRST,
-        jnp.asarray(offsets / ranges[:, None]),
-        jnp.asarray(ranges),
-        every,
-        every & hit,
-        jnp.asarray(sensor, jnp.float32),
+    return trace_rays(config, grid, FIRST, beams_to(ends, sensor, hit))
+
+
+def beams_to(ends, sensor, hit=True):
+    ends, sensor = np.asarray(ends, np.float32), np.asarray(sensor, np.float32)
+    ranges = np.linalg.norm(ends - sensor, axis=1)
+    every = np.ones(len(ends), bool)
+    return Beams(
+        points_world=jnp.asarray(ends),
+        directions_world=jnp.asarray((ends - sensor) / ranges[:, None]),
+        free_ranges=jnp.asarray(ranges),
+        in_range=every,
+        ends=every & hit,
+        inside=every,
+        sensor_world=jnp.asarray(sensor),
     )
 
 
@@ -279,19 +283,7 @@ def test_the_window_around_the_sensor_is_all_that_a_cloud_changes(sensor):
         start, window = evidence.read_evidence(config, parts, jnp.asarray(sensor, jnp.float32))
         sizes.add(window.hits.size)
         window = fuse_hits(config, window, start, ends, np.ones(200, bool), jnp.asarray(sensor))
-        offsets = ends - np.float32(sensor)
-        ranges = np.linalg.norm(offsets, axis=1)
-        every = np.ones(200, bool)
-        window = trace_rays(
-            config,
-            window,
-            start,
-            offsets / ranges[:, None],
-            ranges,
-            every,
-            every,
-            jnp.asarray(sensor),
-        )
+        window = trace_rays(config, window, start, beams_to(ends, sensor))
         parts = evidence.write_evidence(parts, start, fade_evidence(config, window))
     assert max(sizes) < whole.hits.size
     assert np.sum(np.asarray(whole.hits)) > 30
@@ -463,9 +455,7 @@ def test_a_window_gives_what_a_full_recomputation_gives():
         ends = sensor + uniform(int(10 * x), 60, (-spread,) * 3, (spread,) * 3)
         ends[:, 0] += 0.1
         ends = ends.astype(np.float32)
-        box = change.change_by(
-            jnp.asarray(ends), jnp.ones(60, bool), jnp.asarray(sensor, jnp.float32)
-        )
+        box = change.change_by(beams_to(ends, sensor))
         fits.add(bool(jnp.max(box.high_world - box.low_world) <= 0.5))
         boxes = (everywhere(sensor), everywhere(sensor), box)
         for k, config in enumerate((small, large, small)):

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 
 from hiosdf_jax import mapping, uncertainty
 from hiosdf_jax.grid import distance, evidence, frontier, rays, sampling, surface
+from hiosdf_jax.grid.beams import place_cloud
+from hiosdf_jax.grid.change import change_by
 from hiosdf_jax.local import sample_local
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
@@ -42,7 +44,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
     _, grid_key, local_key, order_key, check_key = jax.random.split(state.key, 5)
     cloud, pose = jnp.asarray(cloud, jnp.float32), jnp.asarray(pose, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    beams = jax.jit(mapping.place_cloud, static_argnums=0)(config, cloud, finite, pose)
+    beams = jax.jit(place_cloud, static_argnums=0)(config, cloud, finite, pose)
     sensor_world = beams.sensor_world
     stages: dict[str, Stage] = {}
 
@@ -81,24 +83,21 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         partial(rays.trace_rays, config),
         window,
         start,
-        beams.directions_world,
-        beams.free_ranges,
-        beams.in_range,
-        beams.ends,
-        sensor_world,
+        beams,
     )
     grid = stage("fading", fade, state.grid, start, window)
+    change = change_by(beams)
     grid = stage(
         "distance",
         partial(distance.update_distances, config),
         grid,
-        beams.change,
+        change,
     )
     grid = stage(
         "frontier",
         partial(frontier.update_frontier, config),
         grid,
-        beams.change,
+        change,
     )
     global_samples = stage(
         "grid samples",

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, rays
+from hiosdf_jax.grid.beams import Beams
 
 # Clouds that fill less than this share of the range in each direction, as those of a camera that
 # looks one way or of a sensor in a small room do, are served by a window that is as much smaller.
@@ -30,18 +31,18 @@ class Change(NamedTuple):
     high_world: jax.Array
 
 
-def change_by(ends_world: jax.Array, valid: jax.Array, sensor_world: jax.Array) -> Change:
+def change_by(beams: Beams) -> Change:
     """Finds the box.
 
     Args:
-        ends_world: (N, 3) m, where rays end.
-        valid: (N,) bool; other rows are no rays.
-        sensor_world: (3,) m, where they begin.
+        beams: The cloud.
 
     Returns:
         The change.
     """
-    ends_world = jnp.where(valid[:, None], ends_world, sensor_world)
+    sensor_world = beams.sensor_world
+    ends_world = sensor_world + beams.free_ranges[:, None] * beams.directions_world
+    ends_world = jnp.where(beams.in_range[:, None], ends_world, sensor_world)
     low, high = jnp.min(ends_world, axis=0), jnp.max(ends_world, axis=0)
     return Change(sensor_world, jnp.minimum(low, sensor_world), jnp.maximum(high, sensor_world))
 
