@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import zlib
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax import uncertainty
+from hiosdf_jax import intake, uncertainty
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import distance, evidence, frontier, rays, sampling, surface
 from hiosdf_jax.grid.beams import place_cloud
@@ -85,13 +84,11 @@ def update(state: MapState, cloud: Any, pose: Any) -> MapState:
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
-    _check_shapes(cloud, pose)
+    intake.check_shapes(cloud, pose)
     leaves = (*jax.tree.leaves(state), cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         return _update(state, jnp.asarray(cloud), jnp.asarray(pose))
-    cloud, pose = np.asarray(cloud, np.float32), np.asarray(pose, np.float32)
-    _check_values(cloud, pose)
-    return _update_jit(state, _to_capacity(cloud, pose, state.config.max_points), pose)
+    return _update_jit(state, *intake.prepare(cloud, pose, state.config.max_points))
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
@@ -230,49 +227,6 @@ def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
     return epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
-
-
-def _check_shapes(cloud: Any, pose: Any) -> None:
-    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
-        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
-    if np.shape(pose) != (4, 4):
-        raise ValueError(f"pose has shape {np.shape(pose)}, expected (4, 4)")
-
-
-def _check_values(cloud: np.ndarray, pose: np.ndarray) -> None:
-    if not np.isfinite(pose).all():
-        raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
-    if not is_rigid(pose, np):
-        raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
-    if not _finite_rows(cloud).any():
-        raise ValueError(
-            f"cloud has no finite row among its {len(cloud)}, expected at least one return"
-        )
-
-
-def _to_capacity(cloud: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
-    """Pads a cloud with NaN rows, or draws from its finite rows, to (capacity, 3)."""
-    padded = np.full((capacity, 3), np.nan, np.float32)
-    if len(cloud) <= capacity:
-        padded[: len(cloud)] = cloud
-        return padded
-    rows = np.flatnonzero(_finite_rows(cloud))
-    if len(rows) > capacity:
-        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
-        rng = np.random.default_rng(zlib.crc32(pose.tobytes(), len(rows)))
-        dropped = len(rows) - capacity
-        fewer = min(capacity, dropped)
-        chosen = rng.choice(len(rows), fewer, replace=False, shuffle=False)
-        kept = np.full(len(rows), fewer == dropped)
-        kept[chosen] = fewer != dropped  # chosen are those to drop, or those to keep
-        rows = rows[kept]
-    np.take(cloud, rows, axis=0, out=padded[: len(rows)], mode="clip")
-    return padded
-
-
-def _finite_rows(cloud: np.ndarray) -> np.ndarray:
-    finite = np.isfinite(cloud)
-    return finite[:, 0] & finite[:, 1] & finite[:, 2]  # several times faster than all(axis=1)
 
 
 def _typed_key(key: Any) -> jax.Array:

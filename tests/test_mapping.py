@@ -12,7 +12,7 @@ import pytest
 from room import BOUNDS, CONFIG, HALF, room_cloud, room_sdf, stream
 
 import hiosdf_jax as hio
-from hiosdf_jax import mapping
+from hiosdf_jax import intake, mapping
 from hiosdf_jax.grid import evidence, geometry, surface
 
 
@@ -402,16 +402,37 @@ def test_far_returns_are_averaged_like_near_ones():
     assert abs(0.1 * mean[0] - offsets.mean()) < 1e-3
 
 
-def test_rows_are_drawn_from_the_whole_cloud():
-    cloud = np.arange(9000, dtype=np.float32).reshape(3000, 3)
-    drawn = mapping._to_capacity(cloud, np.eye(4, dtype=np.float32), 300)
-    assert drawn.shape == (300, 3)
-    assert len(np.unique(drawn[:, 0])) == 300
-    assert np.isin(drawn[:, 0], cloud[:, 0]).all()
-    quarters, _ = np.histogram(drawn[:, 0], 4, (0, 9000))
-    assert quarters.min() > 45  # of 75
-    other = mapping._to_capacity(cloud, 2 * np.eye(4, dtype=np.float32), 300)
+def at_height(z):
+    pose = np.eye(4, dtype=np.float32)
+    pose[2, 3] = z
+    return pose
+
+
+@pytest.mark.parametrize("capacity", [300, 2700])
+def test_rows_are_drawn_from_the_whole_cloud(capacity):
+    cloud = np.arange(12000, dtype=np.float32).reshape(4000, 3)
+    cloud[::4, 1] = np.nan
+    drawn, _ = intake.prepare(cloud, at_height(0), capacity)
+    assert drawn.shape == (capacity, 3)
+    rows = (drawn[:, 0] / 3).astype(int)
+    np.testing.assert_array_equal(drawn, cloud[rows])  # no NaN among them
+    assert len(np.unique(rows)) == capacity
+    other, _ = intake.prepare(cloud, at_height(1), capacity)
     assert not np.array_equal(drawn, other)
+    again, _ = intake.prepare(cloud, at_height(0), capacity)
+    np.testing.assert_array_equal(drawn, again)
+
+
+@pytest.mark.parametrize("capacity", [20, 80])
+def test_rows_are_drawn_with_equal_chances(capacity):
+    cloud = np.arange(300, dtype=np.float32).reshape(100, 3)
+    times = np.zeros(100)
+    for z in range(4000):
+        drawn, _ = intake.prepare(cloud, at_height(z), capacity)
+        times[(drawn[:, 0] / 3).astype(int)] += 1
+    share = times / 4000
+    deviation = np.sqrt(capacity / 100 * (1 - capacity / 100) / 4000)
+    assert abs(share - capacity / 100).max() < 5 * deviation
 
 
 def test_update_with_64_bit_numbers_enabled():

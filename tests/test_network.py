@@ -181,6 +181,22 @@ def test_a_step_by_tiles_is_a_step(monkeypatch, every):
             np.testing.assert_allclose(a, b, atol=1e-5)
 
 
+@pytest.mark.parametrize("every", [1, 3])
+def test_the_padding_of_a_gpus_tile_changes_nothing(monkeypatch, every):
+    config = dataclasses.replace(TINY, eikonal_every=every)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(70)
+    plain, losses, _ = train(config, network, samples, 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float32)
+    assert tiles.tile_index(60_000, 4).shape == (1, 60_416)
+    batch = training._split(config, samples, jax.random.key(0))
+    assert batch.sdf.shape == (1, 1, 128 * every)
+    padded, padded_losses, _ = train(config, network, samples, 2)
+    np.testing.assert_allclose(padded_losses, losses, rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
 def test_small_gradients_survive_in_float16(monkeypatch):
     """As on a GPU: a sample's share of a mean would be lost among the smallest numbers."""
     config = dataclasses.replace(TINY, sdf_weight=1e-3, eikonal_weight=1e-3)
@@ -195,7 +211,7 @@ def test_small_gradients_survive_in_float16(monkeypatch):
 @pytest.mark.parametrize("rows", [0, 1, 16, 17, 50])
 def test_tiles_are_all_rows(monkeypatch, rows):
     monkeypatch.setattr(tiles, "_ROWS", 16)
-    dealt = tiles.tile_index(rows)
+    dealt = tiles.tile_index(rows, 4)
     assert dealt.shape[1] <= 16 and dealt.size < rows + len(dealt) + 1
     assert sorted(dealt[dealt < rows]) == list(range(rows))
     points = np.random.default_rng(0).normal(size=(rows, 3)).astype(np.float32)

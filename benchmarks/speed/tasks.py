@@ -21,7 +21,7 @@ from tqdm import tqdm
 import hiosdf_jax as hio
 from benchmarks.speed import baselines, limits, stages
 from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
-from hiosdf_jax import datasets, mapping, served
+from hiosdf_jax import datasets, intake, mapping, served
 from hiosdf_jax.grid import geometry, lookup, surface
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
@@ -205,10 +205,8 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
     state, times_ms, compile_s = _map_frames(bench, config, bench.sizes.frames)
     bench.states[label] = state
     cloud, pose = bench.frame(len(times_ms) + config.warmup_updates)
-    padded = jnp.asarray(mapping._to_capacity(cloud, pose, config.max_points))
-    alone = time_ms(
-        mapping._update_jit, state, padded, jnp.asarray(pose), seconds=bench.sizes.seconds
-    )
+    prepared = jax.device_put(intake.prepare(cloud, pose, config.max_points))
+    alone = time_ms(mapping._update_jit, state, *prepared, seconds=bench.sizes.seconds)
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     # ru_maxrss is in KiB on Linux and in bytes on macOS.
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -463,8 +461,8 @@ def _training_arguments(config: hio.Config) -> tuple[Any, ...]:
 def _take_apart(bench: Bench, label: str) -> dict[str, stages.Stage]:
     state = bench.states[label]
     cloud, pose = bench.frame(int(state.updates))
-    cloud = mapping._to_capacity(cloud, pose, state.config.max_points)
-    return stages.take_apart(state, jnp.asarray(cloud), jnp.asarray(pose))
+    prepared = jax.device_put(intake.prepare(cloud, pose, state.config.max_points))
+    return stages.take_apart(state, *prepared)
 
 
 def _sites(config: hio.Config, grid: Any, sensor_world: jax.Array) -> tuple[np.ndarray, np.ndarray]:

@@ -47,10 +47,11 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
         The rays.
     """
     cloud = jnp.where(finite[:, None], cloud, 0)
-    ranges = safe_norm(cloud)
-    in_range = finite & (ranges >= config.min_range)
     sensor_world = pose[:3, 3]
     offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
+    # Not the cloud's own: a pose that is rigid but for rounding must not take rays out of reach.
+    ranges = safe_norm(offsets_world)
+    in_range = finite & (ranges >= config.min_range)
     points_world = sensor_world + offsets_world
     _, _, inside = geometry.voxel_of(config, points_world)
     return Beams(

@@ -136,7 +136,7 @@ def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
     """
     count = samples.sdf.shape[0]
     size = count // config.batches
-    dealt = tiles.tile_index(size)
+    dealt = tiles.tile_index(size, config.eikonal_every)
     first = np.argsort(np.arange(dealt.shape[1]) % config.eikonal_every > 0, kind="stable")
     dealt = dealt[:, first]
     order = jnp.arange(count) if config.batches == 1 else jax.random.permutation(key, count)

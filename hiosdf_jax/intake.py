@@ -1,0 +1,74 @@
+"""Clouds and poses as a robot gives them: checked, and made to fit the compiled update."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+
+from hiosdf_jax.rigid import is_rigid
+
+
+def check_shapes(cloud: Any, pose: Any) -> None:
+    """Checks what is known of tracers as well.
+
+    Args:
+        cloud: (N, 3).
+        pose: (4, 4).
+
+    Raises:
+        ValueError: A shape is wrong.
+    """
+    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
+        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
+    if np.shape(pose) != (4, 4):
+        raise ValueError(f"pose has shape {np.shape(pose)}, expected (4, 4)")
+
+
+def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Checks the values of a cloud and its pose, and gives the cloud the shape of all others.
+
+    Args:
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
+        pose: (4, 4) T_world_sensor.
+        capacity: Rows to pad with NaN to, or to draw from the finite rows.
+
+    Returns:
+        The cloud (capacity, 3) and the pose, float32.
+
+    Raises:
+        ValueError: The pose is not finite or not rigid, or the cloud has no finite row.
+    """
+    cloud, pose = np.asarray(cloud, np.float32), np.asarray(pose, np.float32)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
+    if not is_rigid(pose, np):
+        raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
+    finite = np.isfinite(cloud)
+    finite = finite[:, 0] & finite[:, 1] & finite[:, 2]  # several times faster than all(axis=1)
+    if not finite.any():
+        raise ValueError(
+            f"cloud has no finite row among its {len(cloud)}, expected at least one return"
+        )
+    padded = np.full((capacity, 3), np.nan, np.float32)
+    if len(cloud) <= capacity:
+        padded[: len(cloud)] = cloud
+    else:
+        rows = _draw(np.flatnonzero(finite), pose, capacity)
+        np.take(cloud, rows, axis=0, out=padded[: len(rows)], mode="clip")
+    return padded, pose
+
+
+def _draw(rows: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
+    """Draws `capacity` of the rows, or all if they are no more, in their order."""
+    if len(rows) <= capacity:
+        return rows
+    # The draw must be a function of the arguments alone, and differ from cloud to cloud.
+    rng = np.random.default_rng(zlib.crc32(pose.tobytes(), len(rows)))
+    dropped = len(rows) - capacity
+    fewer = min(capacity, dropped)
+    chosen = rng.choice(len(rows), fewer, replace=False, shuffle=False)
+    kept = np.full(len(rows), fewer == dropped)
+    kept[chosen] = fewer != dropped  # chosen are those to drop, or those to keep
+    return rows[kept]
