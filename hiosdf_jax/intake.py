@@ -55,20 +55,21 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
     if len(cloud) <= capacity:
         padded[: len(cloud)] = cloud
     else:
-        rows = _draw(np.flatnonzero(finite), pose, capacity)
-        np.take(cloud, rows, axis=0, out=padded[: len(rows)], mode="clip")
+        kept = _draw(finite, pose, capacity)
+        np.compress(kept, cloud, axis=0, out=padded[: np.count_nonzero(kept)])
     return padded, pose
 
 
-def _draw(rows: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
-    """Draws `capacity` of the rows, or all if they are no more, in their order."""
-    if len(rows) <= capacity:
-        return rows
+def _draw(finite: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
+    """Marks `capacity` of the rows that are finite, or all if they are no more."""
+    rows = np.flatnonzero(finite)
+    dropped = len(rows) - capacity
+    if dropped <= 0:
+        return finite
     # The draw must be a function of the arguments alone, and differ from cloud to cloud.
     rng = np.random.default_rng(zlib.crc32(pose.tobytes(), len(rows)))
-    dropped = len(rows) - capacity
     fewer = min(capacity, dropped)
-    chosen = rng.choice(len(rows), fewer, replace=False, shuffle=False)
-    kept = np.full(len(rows), fewer == dropped)
+    chosen = rows[rng.choice(len(rows), fewer, replace=False, shuffle=False)]
+    kept = finite.copy() if fewer == dropped else np.zeros_like(finite)
     kept[chosen] = fewer != dropped  # chosen are those to drop, or those to keep
-    return rows[kept]
+    return kept

@@ -28,8 +28,8 @@ HIDDEN_VOXELS = _BEHIND_STEPS + 1
 # Two float16 numbers are at most so much larger than what they were rounded from.
 _ROUNDING = 1.0007
 
-# Steps a loop iteration makes: fewer, larger kernels.
-_CHUNK = 8
+# Steps a loop iteration makes: few, large kernels, since a GPU waits for the host at each end.
+_CHUNK = 32
 
 
 def trace_rays(config: Config, window: Grid, start: jax.Array, beams: Beams) -> Grid:
