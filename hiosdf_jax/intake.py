@@ -51,12 +51,15 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         raise ValueError(
             f"cloud has no finite row among its {len(cloud)}, expected at least one return"
         )
-    padded = np.full((capacity, 3), np.nan, np.float32)
-    if len(cloud) <= capacity:
-        padded[: len(cloud)] = cloud
+    padded = np.empty((capacity, 3), np.float32)
+    count = len(cloud)
+    if count <= capacity:
+        padded[:count] = cloud
     else:
         kept = _draw(finite, pose, capacity)
-        np.compress(kept, cloud, axis=0, out=padded[: np.count_nonzero(kept)])
+        count = np.count_nonzero(kept)
+        np.compress(kept, cloud, axis=0, out=padded[:count])
+    padded[count:] = np.nan
     return padded, pose
 
 

@@ -12,35 +12,21 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
-from hiosdf_jax import checkpoint, evaluation, mapping, mesh
+from hiosdf_jax import checkpoint, drawing, evaluation, mapping
 from hiosdf_jax.config import Config
 from hiosdf_jax.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax.query import query, sdf_and_grad
 from hiosdf_jax.state import Field, Flag, MapState
 
-if TYPE_CHECKING:
-    import trimesh
-
 # Of a stream without ground truth the map is not given every tenth frame, once it has seen some.
 _FIRST_HELD_OUT = 15
 _HOLD_OUT_EVERY = 10
 _HELD_OUT_POINTS = 20_000  # over all these frames
-
-# A mesh is sampled about this often, within limits: no finer than anyone can see, no coarser than
-# the grid.
-_MESH_SAMPLES = 4e6
-_MESH_FINEST = 0.025  # m
-_SMOOTHINGS = 20  # of the mesh, for its picture
-
-_LEVEL = np.radians(10)  # a normal nearer than this to upwards is that of a floor or a table
-_TILTED = np.radians(2)  # a world whose z is farther than this from upwards is levelled to draw it
-_MARGIN = 0.2  # m, around what is drawn of it
-_HEADROOM = 2.5  # m above the sensor; rooms are lower, and have little to show up there
 
 _FLAG_WORDS = {
     Flag.BAD_POSE: "a pose was not finite or not rigid",
@@ -152,11 +138,8 @@ def run_stream(
 
     _give_back_freed_memory()
     print("drawing slices.png, mesh.ply and mesh.png")
-    surface = _extract(field)
-    up_world = level_up(surface, mapped.up_world)
+    up_world = drawing.draw_map(output, field, exact_sdf, mapped.path_world, mapped.up_world)
     metrics["up_world"] = up_world.tolist()
-    _write_mesh(output, surface, up_world)
-    _draw_slices(output / "slices.png", field, exact_sdf, mapped.path_world, surface, up_world)
     metrics["total_s"] = time.perf_counter() - start
     (output / "metrics.json").write_text(json.dumps(to_json(metrics), indent=2) + "\n", "utf-8")
     print(f"wrote {output}{os.sep} in {metrics['total_s']:.0f} s")
@@ -307,45 +290,6 @@ def to_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def slice_heights(sensor: float, low: float, high: float) -> list[float]:
-    """Chooses where to cut a map: at the sensor's height, half-way down, and in halls half-way up.
-
-    Args:
-        sensor: Height of the sensor, m.
-        low: Height of the floor, m.
-        high: Height of the ceiling, m.
-
-    Returns:
-        One to three heights, m, ascending.
-    """
-    heights = [sensor]
-    if sensor - low >= 0.4:
-        heights.insert(0, (low + sensor) / 2)
-    if high - sensor >= _HEADROOM:
-        heights.append((sensor + high) / 2)
-    return heights
-
-
-def level_up(surface: trimesh.Trimesh, up_world: np.ndarray) -> np.ndarray:
-    """Finds the direction against gravity from floors and tables.
-
-    Args:
-        surface: With normals towards free space.
-        up_world: (3,) unit vector, a first guess.
-
-    Returns:
-        (3,) unit vector; the guess where nothing about level is to be seen.
-    """
-    if not len(surface.faces):
-        return up_world
-    for within in (4 * _LEVEL, 2 * _LEVEL, _LEVEL):
-        level = surface.face_normals @ up_world > np.cos(within)
-        total = (surface.area_faces[level, None] * surface.face_normals[level]).sum(axis=0)
-        if total.any():
-            up_world = total / np.linalg.norm(total)
-    return up_world
-
-
 def _up_of_frame(cloud: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """The direction against gravity of a sensor that is carried upright, (3,), world.
 
@@ -413,71 +357,6 @@ def _summary(metrics: dict[str, Any]) -> str:
     if "bands" in metrics:
         lines += [evaluation.format_bands(metrics["bands"]), ""]
     return "\n".join(lines)
-
-
-def _draw_slices(
-    file: Path,
-    field: Field,
-    exact_sdf: Callable[[np.ndarray], np.ndarray] | None,
-    path_world: np.ndarray,
-    surface: trimesh.Trimesh,
-    up_world: np.ndarray,
-) -> None:
-    """Draws level slices: in the world, or if that is tilted in a frame turned to be upright."""
-    from hiosdf_jax import view
-
-    bounds: Sequence[Sequence[float]] = field.config.bounds
-    tilted = up_world[2] < np.cos(_TILTED)
-    world_from_level = _turn_to(up_world) if tilted else np.eye(3)
-    path = path_world @ world_from_level
-    solid = np.asarray(surface.vertices if len(surface.faces) else bounds) @ world_from_level
-    if tilted:
-        print("the world's z is not upwards: slices.png is in a frame turned to be level")
-        corners = np.concatenate([solid, path])
-        bounds = np.stack([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]).tolist()
-    low, high = np.percentile(solid[:, 2], [2, 98])  # floor and ceiling, but for specks
-    turn = world_from_level.T.astype(np.float32)  # of rows
-    view.save_slices(
-        file,
-        lambda points: _sdf_and_grad(field, points @ turn)[0],
-        None if exact_sdf is None else lambda points: exact_sdf(points @ turn),
-        bounds,
-        slice_heights(float(np.median(path[:, 2])), float(low), float(high)),
-        path_world=path,
-        observed=lambda points: _observed(field, points @ turn),
-    )
-
-
-def _turn_to(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes z to a unit vector, (3, 3)."""
-    if up[2] < -1 + 1e-6:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, z = up
-    skew = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + z)
-
-
-def _extract(field: Field) -> trimesh.Trimesh:
-    low, high = np.asarray(field.config.bounds)
-    spacing = max(float(np.cbrt(np.prod(high - low) / _MESH_SAMPLES)), _MESH_FINEST)
-    return mesh.extract_mesh(field, min(spacing, field.config.voxel_size))
-
-
-def _write_mesh(output: Path, surface: trimesh.Trimesh, up_world: np.ndarray) -> None:
-    from hiosdf_jax import view
-
-    model, picture = output / "mesh.ply", output / "mesh.png"
-    if not len(surface.faces):
-        print("the map shows no surface: no mesh.ply, no mesh.png")
-        for path in (model, picture):  # of an earlier run
-            path.unlink(missing_ok=True)
-        return
-    surface.export(model)
-    from trimesh.smoothing import filter_taubin
-
-    # For the eye only: between patches the surface has steps of some millimetres.
-    smooth = filter_taubin(surface.copy(), iterations=_SMOOTHINGS)
-    view.save_shaded(picture, smooth, up_world=up_world.tolist())
 
 
 # The map is an argument, so that these compile once for maps of one configuration.

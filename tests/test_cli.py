@@ -376,36 +376,3 @@ def test_demo(tmp_path, capsys):
     assert "collisions found" in capsys.readouterr().out
     picture = imread(output / "slices.png")
     assert picture.shape[1] > 1.3 * picture.shape[0]  # map, truth and error side by side
-
-
-def test_slice_heights():
-    assert run.slice_heights(1.2, 0.0, 2.6) == [0.6, 1.2]
-    assert run.slice_heights(1.0, 0.0, 9.0) == [0.5, 1.0, 5.0]
-    assert run.slice_heights(0.3, 0.0, 1.0) == [0.3]
-
-
-def test_level_up():
-    room = trimesh.creation.box(HIGH - LOW)
-    room.invert()  # free space is inside
-    turn = trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])
-    room.apply_transform(turn)
-    up = turn[:3, 2]
-    guess = up + np.array([0.3, -0.1, 0.1])
-    np.testing.assert_allclose(run.level_up(room, guess / np.linalg.norm(guess)), up, atol=1e-6)
-    np.testing.assert_array_equal(run.level_up(trimesh.Trimesh(), up), up)
-
-
-def test_no_surface_leaves_no_old_mesh(tmp_path, capsys):
-    for name in ("mesh.ply", "mesh.png"):
-        (tmp_path / name).write_text("of an earlier run")
-    run._write_mesh(tmp_path, trimesh.Trimesh(), np.array([0.0, 0, 1]))
-    assert not list(tmp_path.iterdir())
-    assert "no surface" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0.6, 0, -0.8], [0, 0, -1]])
-def test_turn_to(up):
-    turn = run._turn_to(np.array(up, float))
-    np.testing.assert_allclose(turn @ [0, 0, 1], up, atol=1e-12)
-    np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) == pytest.approx(1)
