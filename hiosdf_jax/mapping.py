@@ -69,6 +69,7 @@ def update(state: MapState, cloud: Any, pose: Any) -> MapState:
     Pure: the given state stays valid. Called with concrete arrays it checks them, pads or draws
     the cloud to `config.max_points` rows and runs one compiled function; called inside `jit`,
     `lax.scan` or `vmap` it takes the shapes as they are and reports by `state.report.flags`.
+    Under `vmap` what is computed in the smaller window of two is computed in both.
 
     Args:
         state: The map so far.
@@ -169,7 +170,7 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
     start, window = evidence.read_evidence(config, state.grid, sensor_world)
     window = surface.fuse_hits(config, window, start, beams.points_world, beams.ends, sensor_world)
     window = rays.trace_rays(config, window, start, beams)
-    window = rays.fade_evidence(config, window)
+    window = evidence.fade_evidence(config, window)
     grid = evidence.write_evidence(state.grid, start, window)
     change = change_by(beams)
     grid = distance.update_distances(config, grid, change)

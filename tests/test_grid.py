@@ -23,7 +23,8 @@ from hiosdf_jax.grid import (
     sampling,
     surface,
 )
-from hiosdf_jax.grid.beams import Beams
+from hiosdf_jax.grid.beams import Beams, place_cloud
+from hiosdf_jax.rigid import is_rigid
 from hiosdf_jax.samples import draw_from_mask
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
@@ -36,7 +37,7 @@ FIRST = jnp.zeros(3, jnp.int32)  # the window is the whole grid
 # One compilation a stage and configuration, as in an update.
 fuse_hits = jax.jit(surface.fuse_hits, static_argnums=0)
 trace_rays = jax.jit(rays.trace_rays, static_argnums=0)
-fade_evidence = jax.jit(rays.fade_evidence, static_argnums=0)
+fade_evidence = jax.jit(evidence.fade_evidence, static_argnums=0)
 update_distances = jax.jit(distance.update_distances, static_argnums=0)
 update_frontier = jax.jit(frontier.update_frontier, static_argnums=0)
 
@@ -269,10 +270,10 @@ def test_rays_against_a_loop(hit):
 
 @pytest.mark.parametrize("sensor", [(0.31, 0.52, 0.63), (0.95, 0.95, 0.15), (1.0, 0.5, 0.6)])
 def test_the_window_around_the_sensor_is_all_that_a_cloud_changes(sensor):
-    config = dataclasses.replace(CONFIG, max_range=0.35, voxel_size=0.05, min_range=0.0)
+    config = dataclasses.replace(CONFIG, max_range=0.15, voxel_size=0.05, min_range=0.0)
     rng = np.random.default_rng(11)
-    away = rng.normal(size=(200, 3))
-    reach = rng.uniform(0.05, 0.35, (200, 1))
+    away = rng.normal(size=(300, 3))
+    reach = rng.uniform(0.05, 0.15, (300, 1))
     ends = (np.array(sensor) + reach * away / np.linalg.norm(away, axis=1)[:, None]).astype(
         np.float32
     )
@@ -281,18 +282,45 @@ def test_the_window_around_the_sensor_is_all_that_a_cloud_changes(sensor):
         whole = trace(fuse(whole, ends, sensor, config=config), ends, sensor, config=config)
         whole = fade_evidence(config, whole)
         start, window = evidence.read_evidence(config, parts, jnp.asarray(sensor, jnp.float32))
-        sizes.add(window.hits.size)
-        window = fuse_hits(config, window, start, ends, np.ones(200, bool), jnp.asarray(sensor))
+        sizes.add(window.hits.shape)
+        window = fuse_hits(config, window, start, ends, np.ones(300, bool), jnp.asarray(sensor))
         window = trace_rays(config, window, start, beams_to(ends, sensor))
         parts = evidence.write_evidence(parts, start, fade_evidence(config, window))
-    assert max(sizes) < whole.hits.size
+    assert all(part < all_of for part, all_of in zip(*sizes, whole.hits.shape, strict=True))
     assert np.sum(np.asarray(whole.hits)) > 30
     for name in ("hits", "passes", "behind"):
-        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+        stored = np.asarray(getattr(whole, name), np.float16)
+        np.testing.assert_array_equal(getattr(parts, name), stored)
     np.testing.assert_allclose(
         np.asarray(parts.weight, np.float32) ** 2, whole.weight, rtol=4e-3, atol=1e-6
     )
     np.testing.assert_allclose(parts.surface.mean, whole.surface.mean, atol=3e-3)
+
+
+def test_evidence_fades_only_where_rays_come_by():
+    rng = np.random.default_rng(3)
+    share = rng.random(SHAPE)
+    rays_of = CONFIG.evidence_limit * rng.uniform(0.998, 1.002, SHAPE)
+    grid = evidence.empty_grid(CONFIG).replace(hits=share * rays_of, passes=(1 - share) * rays_of)
+    start = np.zeros(3, np.int32)
+    stored = [evidence.empty_grid(CONFIG)]
+    for _ in range(3):
+        stored.append(evidence.write_evidence(stored[0], start, fade_evidence(CONFIG, grid)))
+        grid = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), stored[-1])
+    assert not same(stored[1].hits, stored[0].hits)
+    assert same(stored[2], stored[1]) and same(stored[3], stored[1])
+
+
+def test_a_pose_of_few_digits_takes_no_ray_out_of_reach():
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] *= 1.002
+    assert is_rigid(pose, np)
+    cloud = np.array([[0, 0, 0.9991], [0, 0.9, 0], [0.999, 0, 0], [5, 0, 0]], np.float32)
+    config = dataclasses.replace(CONFIG, max_range=1.0)
+    beams = place_cloud(config, jnp.asarray(cloud), np.ones(4, bool), jnp.asarray(pose))
+    np.testing.assert_array_equal(beams.ends, [False, True, False, False])
+    np.testing.assert_allclose(beams.free_ranges, [1, 0.9018, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(beams.directions_world, axis=1), 1, rtol=1e-6)
 
 
 def test_a_vanished_wall_is_carved_and_a_new_one_believed():
@@ -443,20 +471,35 @@ def test_a_sheet_seen_from_both_sides_is_free_on_both():
     assert np.abs(error).max() < 0.01
 
 
-def test_a_window_gives_what_a_full_recomputation_gives():
-    bounds = ((0.0, 0.0, 0.0), (6.0, 1.0, 1.0))
+@pytest.mark.parametrize(
+    ("voxel", "max_range", "horizons", "scale", "shapes"),
+    [
+        (0.1, 0.5, (0.6, 0.4), 1.0, [41, 47]),
+        # 2 + 0.8 + 0.4 + 0.2 + 0.4 m is, rounded, not more than 19 voxels of 0.2 m.
+        (0.2, 2.0, (0.4, 0.4), 4.0, [31, 41]),
+    ],
+)
+def test_a_window_gives_what_a_full_recomputation_gives(voxel, max_range, horizons, scale, shapes):
+    bounds = ((0.0, 0.0, 0.0), (6.0 * scale, scale, scale))
     small = dataclasses.replace(
-        CONFIG, bounds=bounds, max_range=0.5, distance_horizon=0.6, frontier_horizon=0.4
+        CONFIG,
+        voxel_size=voxel,
+        bounds=bounds,
+        max_range=max_range,
+        distance_horizon=horizons[0],
+        frontier_horizon=horizons[1],
     )
-    large = dataclasses.replace(small, max_range=50.0)
+    large = dataclasses.replace(small, max_range=50.0 * scale)
     grids, fits = [empty_grid(small), empty_grid(large), empty_grid(small)], set()
     for x, spread in ((0.5, 0.2), (2.0, 0.25), (3.3, 0.35), (2.2, 0.1), (0.9, 0.15)):
-        sensor = np.array([x, 0.5, 0.5])
-        ends = sensor + uniform(int(10 * x), 60, (-spread,) * 3, (spread,) * 3)
-        ends[:, 0] += 0.1
+        sensor = scale * np.array([x, 0.5, 0.5])
+        ends = sensor + scale * uniform(int(10 * x), 60, (-spread,) * 3, (spread,) * 3)
+        ends[:, 0] += 0.1 * scale
         ends = ends.astype(np.float32)
         box = change.change_by(beams_to(ends, sensor))
-        fits.add(bool(jnp.max(box.high_world - box.low_world) <= 0.5))
+        half, whole, fit = change.windows(small, box, horizons[0])
+        assert [half.shape[0], whole.shape[0]] == shapes
+        fits.add(bool(fit))
         boxes = (everywhere(sensor), everywhere(sensor), box)
         for k, config in enumerate((small, large, small)):
             grid = fuse(grids[k], ends, sensor, config=config)
@@ -464,9 +507,7 @@ def test_a_window_gives_what_a_full_recomputation_gives():
             grid = update_distances(config, grid, boxes[k])
             grids[k] = update_frontier(config, grid, boxes[k])
     assert fits == {True, False}
-    # The windows: of a small change, of any, of all.
-    reaches = (0.25 + 0.4 + 1.2 + 0.1, 0.5 + 0.4 + 1.2 + 0.1, 100.0)
-    assert [geometry.window_shape(small, reach)[0] for reach in reaches] == [41, 45, 60]
+    assert max(shapes) < small.grid_shape[0]
     assert same(grids[0].surface, grids[1].surface)
     assert same(grids[2].surface, grids[1].surface)
 

@@ -439,9 +439,14 @@ def test_update_with_64_bit_numbers_enabled():
     """Many controllers enable them before they import anything."""
     code = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"
-        "import numpy as np, hiosdf_jax as hio\n"
+        "import dataclasses, numpy as np, hiosdf_jax as hio\n"
+        "from hiosdf_jax.network import tiles\n"
         "from room import CONFIG, stream\n"
-        "state = hio.update(hio.init(CONFIG, jax.random.key(0)), *stream(1)[0])\n"
+        # Both windows of a change, and several tiles of the network's rows.
+        "config = dataclasses.replace(CONFIG, bounds=((-9, -1, -1), (9, 1, 1)), batches=1,\n"
+        "    max_range=2.0, near_samples=2000)\n"
+        "assert tiles.tile_count(2500) > 1\n"
+        "state = hio.update(hio.init(config, jax.random.key(0)), *stream(1)[0])\n"
         "assert np.isfinite(hio.sdf_and_grad(state, np.zeros((5, 3)))[1]).all()\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)

@@ -6,6 +6,7 @@ on this machine over the time that it took.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 
 from benchmarks.speed.rows import Row, single, time_ms
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid import geometry
+from hiosdf_jax.grid.change import Windows
 from hiosdf_jax.network import passes
 
 
@@ -143,18 +144,14 @@ def nearest_work(queries: int, points: int) -> Work:
     return Work(vector=9.0 * queries * points, memory=12.0 * points + 16.0 * queries)
 
 
-def distance_work(config: Config) -> Work:
-    """Of the distance transform's memory: the window's evidence read and its answers written once.
+def distance_work(windows: Windows) -> Work:
+    """Of the distance transform's memory: the evidence read and the answers written once.
 
     Evidence: hits, passes, behind, mean (3) and axes (9) in float16, 30 bytes a voxel. Answers:
-    nearest (3) in int8, sdf and doubt in float16, 7 bytes a voxel of the inner window. How many
+    nearest (3) in int8, sdf and doubt in float16, 7 bytes a voxel that can have changed. How many
     shifts the passes try depends on the map, so that operations are not counted.
     """
-    horizon = config.horizon_voxels * config.voxel_size
-    changed = config.max_range + horizon + config.voxel_size
-    x, y, z = geometry.window_shape(config, changed + horizon)
-    inner_x, inner_y, inner_z = geometry.window_shape(config, changed)
-    return Work(memory=30.0 * x * y * z + 7.0 * inner_x * inner_y * inner_z)
+    return Work(memory=30.0 * math.prod(windows.shape) + 7.0 * math.prod(windows.inner_shape))
 
 
 def baked_work(points: int) -> Work:

@@ -55,7 +55,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         return result
 
     def fade(grid: Any, start: jax.Array, window: Any) -> Any:
-        return evidence.write_evidence(grid, start, rays.fade_evidence(config, window))
+        return evidence.write_evidence(grid, start, evidence.fade_evidence(config, window))
 
     stage(
         "calibration",

@@ -23,6 +23,7 @@ from benchmarks.speed import baselines, limits, stages
 from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
 from hiosdf_jax import datasets, intake, mapping, served
 from hiosdf_jax.grid import geometry, lookup, surface
+from hiosdf_jax.grid.change import Windows, windows
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
 from hiosdf_jax.samples import Samples
@@ -249,10 +250,12 @@ def stage_rows(bench: Bench, label: str) -> list[Row]:
     queries = np.asarray(parts["local samples"].result.points_world)
     cloud, valid = np.asarray(cloud), np.asarray(valid)
     grid, change = parts["distance"].arguments
-    features, doubtful = _sites(config, grid, change.sensor_world)
+    small, large, fits = windows(config, change, config.horizon_voxels * config.voxel_size)
+    searched = small if fits else large
+    features, doubtful = _sites(config, grid, searched)
     work = {
         "training": limits.training_work(config),
-        "distance": limits.distance_work(config),
+        "distance": limits.distance_work(searched),
         "local samples": limits.nearest_work(len(queries), len(cloud)),
     }
     compare = {"training": "training", "local samples": "nearest", "distance": "distance"}
@@ -465,11 +468,9 @@ def _take_apart(bench: Bench, label: str) -> dict[str, stages.Stage]:
     return stages.take_apart(state, *prepared)
 
 
-def _sites(config: hio.Config, grid: Any, sensor_world: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+def _sites(config: hio.Config, grid: Any, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
     """The voxels of the distance transform's window that its two searches look for."""
-    horizon = config.horizon_voxels * config.voxel_size
-    shape = geometry.window_shape(config, config.max_range + 2 * horizon + config.voxel_size)
-    start = geometry.window_start(config, shape, sensor_world)
+    start, shape = windows.start, windows.shape
     hits, passes = (
         geometry.read_window(array, start, shape).astype(jnp.float32)
         for array in (grid.hits, grid.passes)

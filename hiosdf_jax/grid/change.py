@@ -47,33 +47,82 @@ def change_by(beams: Beams) -> Change:
     return Change(sensor_world, jnp.minimum(low, sensor_world), jnp.maximum(high, sensor_world))
 
 
-def recompute[T](
-    config: Config,
-    change: Change,
-    margin: float,
-    function: Callable[[jax.Array, float], T],
-) -> T:
-    """Computes something again where a cloud has changed it, in the smaller window that will do.
+class Windows(NamedTuple):
+    """Two boxes of voxels, one in the other: what is read, and what can have changed.
+
+    Attributes:
+        start: First voxel of what is read, three int32 scalars.
+        shape: Of what is read, static.
+        inner_start: First voxel of what can have changed.
+        inner_shape: Of what can have changed, static.
+    """
+
+    start: tuple[jax.Array, ...]
+    shape: tuple[int, int, int]
+    inner_start: tuple[jax.Array, ...]
+    inner_shape: tuple[int, int, int]
+
+    @property
+    def within(self) -> tuple[jax.Array, ...]:
+        """First voxel of what can have changed, counted from that of what is read."""
+        return tuple(a - b for a, b in zip(self.inner_start, self.start, strict=True))
+
+
+def windows(
+    config: Config, change: Change, horizon_m: float
+) -> tuple[Windows, Windows, jax.Array | bool]:
+    """Places the windows in which something that reaches as far as a horizon is computed again.
+
+    A voxel changes only within the horizon of new evidence, and what decides on it lies within the
+    horizon of it: the window read is that much larger than what can have changed.
 
     Args:
         config: The map's configuration.
         change: Of the cloud.
-        margin: How much farther than the rays the function reads, m.
-        function: Takes the middle of the change (3,), m, and the reach of its rays from there
-            along each axis, m, a static number.
+        horizon_m: The horizon, a static number.
+
+    Returns:
+        small: Around the box of the rays.
+        large: Around the sensor, for rays of any direction.
+        fits: () bool, whether the small ones will do.
+    """
+    hidden_m = rays.HIDDEN_VOXELS * config.voxel_size
+
+    def around(center_world: jax.Array, ray_reach_m: float) -> Windows:
+        changed_m = ray_reach_m + hidden_m + horizon_m + config.voxel_size
+        # Half a voxel more, so that rounding takes none from the margin around what is written.
+        shape = geometry.window_shape(config, changed_m + horizon_m + config.voxel_size / 2)
+        inner_shape = geometry.window_shape(config, changed_m)
+        return Windows(
+            geometry.window_start(config, shape, center_world),
+            shape,
+            geometry.window_start(config, inner_shape, center_world),
+            inner_shape,
+        )
+
+    large = around(change.sensor_world, config.max_range)
+    small_reach_m = _SMALL * config.max_range
+    small = around((change.low_world + change.high_world) / 2, small_reach_m)
+    if small.shape == large.shape:
+        return large, large, True
+    return small, large, jnp.max(change.high_world - change.low_world) <= 2 * small_reach_m
+
+
+def recompute[T](
+    config: Config, change: Change, horizon_m: float, function: Callable[[Windows], T]
+) -> T:
+    """Computes something again where a cloud has changed it, in the smaller windows that will do.
+
+    Args:
+        config: The map's configuration.
+        change: Of the cloud.
+        horizon_m: How far evidence reaches, a static number.
+        function: Computes it in windows.
 
     Returns:
         What the function returns.
     """
-    hidden = rays.HIDDEN_VOXELS * config.voxel_size
-    small, large = (share * config.max_range + hidden for share in (_SMALL, 1.0))
-    shapes = [geometry.window_shape(config, reach + margin) for reach in (small, large)]
-    if shapes[0] == shapes[1]:
-        return function(change.sensor_world, large)
-    extent = jnp.max(change.high_world - change.low_world)
-    middle = (change.low_world + change.high_world) / 2
-    return jax.lax.cond(
-        extent <= 2 * (small - hidden),
-        lambda: function(middle, small),
-        lambda: function(change.sensor_world, large),
-    )
+    small, large, fits = windows(config, change, horizon_m)
+    if small.shape == large.shape:
+        return function(large)
+    return jax.lax.cond(fits, lambda: function(small), lambda: function(large))

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, surface
-from hiosdf_jax.grid.change import Change, recompute
+from hiosdf_jax.grid.change import Change, Windows, recompute
 from hiosdf_jax.state import Grid, Surface
 
 NO_FEATURE = -128
-"""`Grid.nearest` where there is no feature within the horizon."""
+"""`Surface.nearest` where there is no feature within the horizon."""
 
 _INFINITE = 1e12  # squared voxels
 
@@ -140,23 +140,17 @@ def update_distances(config: Config, grid: Grid, change: Change) -> Grid:
     """
     horizon_m = config.horizon_voxels * config.voxel_size
 
-    def around(center_world: jax.Array, reach: float) -> Surface:
-        return _distances_around(config, grid, center_world, reach)
+    def inside(windows: Windows) -> Surface:
+        return _distances_in(config, grid, windows)
 
-    return grid.replace(surface=recompute(config, change, 2 * horizon_m, around))
+    return grid.replace(surface=recompute(config, change, horizon_m, inside))
 
 
-def _distances_around(config: Config, grid: Grid, center_world: jax.Array, reach: float) -> Surface:
-    """The same, for evidence within `reach` metres of a point along the axes.
-
-    A voxel changes only within reach + horizon of it, and the features that decide on a voxel lie
-    within the horizon: the window read is that much larger than the part written.
-    """
-    horizon_m = config.horizon_voxels * config.voxel_size
-    changed = reach + horizon_m + config.voxel_size
-    # Half a voxel more, so that rounding does not take one from the margin around what is written.
-    shape = geometry.window_shape(config, changed + horizon_m + config.voxel_size / 2)
-    start = geometry.window_start(config, shape, center_world)
+def _distances_in(config: Config, grid: Grid, windows: Windows) -> Surface:
+    """The grid's surface with new distances in windows that hold all new evidence."""
+    start, shape, inner_start, inner = windows
+    within = windows.within
+    part = Part(within, inner)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)
         for array in (
@@ -168,10 +162,6 @@ def _distances_around(config: Config, grid: Grid, center_world: jax.Array, reach
         )
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
-    inner = geometry.window_shape(config, changed)
-    inner_start = geometry.window_start(config, inner, center_world)
-    within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
-    part = Part(within, inner)
     features = surface.is_feature(config, hits, passes, axes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part)
     nearest = nearest.ravel()

@@ -13,6 +13,9 @@ from hiosdf_jax.state import Grid, Surface
 # Half the memory, and finer than the noise.
 _STORED = jnp.float16
 
+# Two such numbers are at most so much larger than what they were rounded from.
+_ROUNDING = 1.0007
+
 
 def empty_grid(config: Config) -> Grid:
     """A grid that no ray has met."""
@@ -55,6 +58,38 @@ def read_evidence(config: Config, grid: Grid, sensor_world: jax.Array) -> tuple[
         behind=window.behind.astype(jnp.float32),
         weight=window.weight.astype(jnp.float32) ** 2,
     )
+
+
+def fade_evidence(config: Config, window: Grid) -> Grid:
+    """Lets old evidence fade so that a voxel remembers `evidence_limit` rays.
+
+    That bounds how long a surface that has vanished, or appeared, has to be seen to be believed.
+
+    Args:
+        config: The map's configuration.
+        window: The grid, or the part of it that has new evidence.
+
+    Returns:
+        The window with scaled hits, weight, passes and behind.
+    """
+    # As they will be stored: what rounding adds then is not taken for new evidence the next time,
+    # so that nothing fades where no ray comes by.
+    hits, passes = (_rounded(counts) for counts in (window.hits, window.passes))
+    above = hits + passes > _ROUNDING * config.evidence_limit
+    rays = jnp.maximum(window.hits + window.passes, 1)
+    scale = jnp.where(above, config.evidence_limit / rays, 1)
+    return window.replace(
+        hits=window.hits * scale,
+        weight=window.weight * scale,
+        passes=window.passes * scale,
+        behind=jnp.minimum(window.behind, config.evidence_limit),
+    )
+
+
+def _rounded(values: jax.Array) -> jax.Array:
+    """What storing will make of them; converting there and back may be simplified away."""
+    kind = jnp.finfo(_STORED)
+    return jax.lax.reduce_precision(values, kind.nexp, kind.nmant)
 
 
 def write_evidence(grid: Grid, start: jax.Array, window: Grid) -> Grid:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, lookup
-from hiosdf_jax.grid.change import Change, recompute
+from hiosdf_jax.grid.change import Change, Windows, recompute
 from hiosdf_jax.state import Grid
 
 _INFINITE = 1e12  # squared voxels
@@ -69,22 +69,16 @@ def update_frontier(config: Config, grid: Grid, change: Change) -> Grid:
     """
     horizon_m = config.frontier_voxels * config.voxel_size
 
-    def around(center_world: jax.Array, reach: float) -> jax.Array:
-        return _frontier_around(config, grid, center_world, reach)
+    def inside(windows: Windows) -> jax.Array:
+        return _frontier_in(config, grid, windows)
 
-    frontier = recompute(config, change, 2 * horizon_m, around)
+    frontier = recompute(config, change, horizon_m, inside)
     return grid.replace(surface=grid.surface.replace(frontier=frontier))
 
 
-def _frontier_around(
-    config: Config, grid: Grid, center_world: jax.Array, reach: float
-) -> jax.Array:
-    """The grid's frontier for evidence within `reach` metres of a point along the axes."""
-    horizon_m = config.frontier_voxels * config.voxel_size
-    changed = reach + horizon_m + config.voxel_size
-    # Half a voxel more, so that rounding does not take one from the margin around what is written.
-    shape = geometry.window_shape(config, changed + horizon_m + config.voxel_size / 2)
-    start = geometry.window_start(config, shape, center_world)
+def _frontier_in(config: Config, grid: Grid, windows: Windows) -> jax.Array:
+    """The grid's frontier, new in windows that hold all new evidence."""
+    start, shape, inner_start, inner = windows
     seen = lookup.observed(
         geometry.read_window(grid.passes, start, shape),
         geometry.read_window(grid.hits, start, shape),
@@ -95,10 +89,7 @@ def _frontier_around(
         border = jnp.minimum(index, config.grid_shape[axis] - 1 - index) + 0.5
         distance = jnp.where(seen, jnp.minimum(distance, border), distance)
 
-    inner = geometry.window_shape(config, changed)
-    inner_start = geometry.window_start(config, inner, center_world)
-    within = tuple(a - b for a, b in zip(inner_start, start, strict=True))
-    metres = geometry.read_window(distance * config.voxel_size, within, inner)
+    metres = geometry.read_window(distance * config.voxel_size, windows.within, inner)
     # Rounded down: never farther than it is.
     steps = (
         jnp.floor(metres / geometry.frontier_step_m(config))

@@ -25,9 +25,6 @@ _BEHIND_STEPS = 3
 HIDDEN_VOXELS = _BEHIND_STEPS + 1
 """Rays change nothing farther behind their ends."""
 
-# Two float16 numbers are at most so much larger than what they were rounded from.
-_ROUNDING = 1.0007
-
 # Steps a loop iteration makes: few, large kernels, since a GPU waits for the host at each end.
 _CHUNK = 32
 
@@ -78,30 +75,6 @@ def trace_rays(config: Config, window: Grid, start: jax.Array, beams: Beams) -> 
     hidden = jnp.broadcast_to((beams.in_range & ends)[:, None], steps.shape)
     behind = count(window.behind.ravel(), steps, hidden)
     return window.replace(passes=passes.reshape(shape), behind=behind.reshape(shape))
-
-
-def fade_evidence(config: Config, window: Grid) -> Grid:
-    """Lets old evidence fade so that a voxel remembers `evidence_limit` rays.
-
-    That bounds how long a surface that has vanished, or appeared, has to be seen to be believed.
-
-    Args:
-        config: The map's configuration.
-        window: The grid, or the part of it that has new evidence.
-
-    Returns:
-        The window with scaled hits, weight, passes and behind.
-    """
-    rays = window.hits + window.passes
-    # What was rounded when it was stored is no new evidence: far from the cloud nothing changes.
-    above = rays > _ROUNDING * config.evidence_limit
-    scale = jnp.where(above, config.evidence_limit / jnp.maximum(rays, 1), 1)
-    return window.replace(
-        hits=window.hits * scale,
-        weight=window.weight * scale,
-        passes=window.passes * scale,
-        behind=jnp.minimum(window.behind, config.evidence_limit),
-    )
 
 
 def _phases(count: int) -> jax.Array:

@@ -21,7 +21,8 @@ _SUPERSAMPLING = 2  # picture elements along each side of a pixel
 _ELEVATION = np.deg2rad(52)  # of the camera: high enough to see over the walls of a room
 _AZIMUTH = np.deg2rad(24)  # off the long side: a view square onto it shows no second wall
 _MARGIN = 0.03  # of the picture, left free on each side
-_FACES_PER_BATCH = 20_000  # these two bound the memory
+# These two bound what is needed besides the mesh and the picture.
+_FACES_PER_BATCH = 20_000
 _ROWS_PER_BAND = 64
 _AMBIENT = 0.2
 _LIGHT = np.array([-0.35, 0.7, 0.9])  # towards it: the picture's right, level to the viewer, up
