@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import os
 import uuid
@@ -37,10 +38,13 @@ def save(path: str | os.PathLike[str], state: MapState) -> None:
 
     Raises:
         ValueError: `state` is not a map.
+        FileNotFoundError: There is no such folder.
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState")
     path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "no such folder", str(path.parent))
     header = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -81,7 +85,9 @@ def load(path: str | os.PathLike[str]) -> MapState:
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
-        raise ValueError(f"{path} is not a readable .npz file: {error}") from error
+        # Of other files numpy says that they might be pickles, and how to load those.
+        reason = "it is none" if "pickle" in str(error) else error
+        raise ValueError(f"{path} is not a readable .npz file: {reason}") from error
     try:
         header = json.loads(str(arrays.pop("header")))
         if header["format"] != _FORMAT:

@@ -114,6 +114,15 @@ def _map(options: argparse.Namespace) -> None:
 
     if options.save is not None and not options.save.parent.is_dir():
         raise _Failure(f"{options.save.parent}: no such folder", _BAD_INPUT)
+    if options.ground_truth is not None and not options.ground_truth.exists():
+        raise _Failure(f"{options.ground_truth}: No such file or folder", _BAD_INPUT)
+    bounds, max_range = options.bounds, options.max_range
+    if bounds is not None:
+        bounds = (tuple(bounds[:3]), tuple(bounds[3:]))
+    overrides = {"max_range": max_range, "voxel_size": options.voxel_size}
+    overrides = {name: value for name, value in overrides.items() if value is not None}
+    # Before minutes are spent on reading; on some box, if it is still to be found.
+    _configure(options.config, bounds or ((0, 0, 0), (10, 10, 10)), **overrides)
     names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
     chosen = {name: getattr(options, name) for name in names}
     chosen = {name: value for name, value in chosen.items() if value is not None}
@@ -124,9 +133,6 @@ def _map(options: argparse.Namespace) -> None:
     if options.frames is not None:
         count = min(options.frames, len(stream))
         stream = datasets.FrameStream(options.stream, count, stream.__getitem__)
-    bounds, max_range = options.bounds, options.max_range
-    if bounds is not None:
-        bounds = (tuple(bounds[:3]), tuple(bounds[3:]))
     if bounds is None or max_range is None:
         extent = _checked(
             lambda: datasets.find_bounds(stream, skip_bad_frames=options.skip_bad_frames),
@@ -142,9 +148,7 @@ def _map(options: argparse.Namespace) -> None:
     exact_sdf = None
     if options.ground_truth is not None:
         truth, exact_sdf = _ground_truth(options.ground_truth, stream, max_range)
-    overrides = {"max_range": max_range}
-    if options.voxel_size is not None:
-        overrides["voxel_size"] = options.voxel_size
+    overrides["max_range"] = max_range
     place = options.stream.absolute()
     _run(
         stream,

@@ -22,7 +22,8 @@ Unknown = Literal["network", "obstacle"]
 def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array:
     """Signed distance to the nearest surface.
 
-    Outside the bounds it is the distance to the box plus the value at the box's nearest point.
+    Outside the bounds it is the distance to the box plus the value at the box's nearest point; for
+    a point with a NaN it is -1e30, so that a rollout that has diverged is not taken for safe.
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
@@ -138,7 +139,9 @@ def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown) -> jax.
         value = lattice.interpolate(field, field.sdf, inside)
     else:
         value = served.served_sdf(field, inside)
-    value = value + beyond
+    # A point that is no point is nowhere safe: as deep inside as others are far outside.
+    nowhere = jnp.any(jnp.isnan(points), axis=-1)
+    value = value + jnp.where(nowhere, -beyond, beyond)
     return value if unknown == "network" else jnp.minimum(value, _frontier(field, points))
 
 
@@ -156,6 +159,7 @@ def _split(field: Field | Baked, points: jax.Array) -> tuple[jax.Array, jax.Arra
     """The nearest points of the box, (..., 3) m, and the distances to it, (...) m."""
     low, high = lattice.bounds(field) if isinstance(field, Baked) else field.config.bounds
     low, high = jnp.asarray(low, points.dtype), jnp.asarray(high, points.dtype)
+    points = jnp.where(jnp.isnan(points), _FAR, points)
     nearest = geometry.clip_to_box(points, low, high)
     beyond = points - nearest
     # Scaled by the largest component, since the square of a far point would overflow.
@@ -171,7 +175,5 @@ def _checked(points: Any, unknown: Any) -> jax.Array:
     points = jnp.asarray(points)
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points has shape {points.shape}, expected (..., 3)")
-    # Infinite points are taken as very far ones, and so are those that are no points at all:
-    # inf - inf would be NaN.
-    points = points.astype(jnp.float32)
-    return jnp.clip(jnp.where(jnp.isnan(points), _FAR, points), -_FAR, _FAR)
+    # Infinite points are taken as very far ones: inf - inf would be NaN.
+    return jnp.clip(points.astype(jnp.float32), -_FAR, _FAR)

@@ -316,6 +316,12 @@ def test_load_names_what_is_wrong(mapped, tmp_path):
     broken.write_bytes(b"PK\x03\x04 not a zip")
     with pytest.raises(ValueError, match=r"broken.npz is not a readable"):
         hio.load(broken)
+    picture = tmp_path / "picture.png"
+    picture.write_bytes(b"\x89PNG and no archive")
+    with pytest.raises(ValueError, match=r"picture.png is not a readable .npz file: it is none$"):
+        hio.load(picture)
+    with pytest.raises(FileNotFoundError, match=r"no such folder.*nowhere'"):
+        hio.save(tmp_path / "nowhere" / "map", mapped)
     foreign = tmp_path / "foreign.npz"
     np.savez(foreign, a=np.zeros(3))
     with pytest.raises(ValueError, match=r"foreign.npz is not a hiosdf_jax map"):

@@ -92,6 +92,17 @@ def test_extreme_points_give_finite_answers(field):
     assert np.isfinite(np.asarray(solid.grad)).all()
 
 
+@pytest.mark.parametrize("unknown", ["network", "obstacle"])
+def test_a_point_with_a_nan_is_not_safe(field, unknown):
+    lost = np.array([[np.nan, 0, 0], [np.nan, np.nan, np.inf], [0, 0, np.nan]], np.float32)
+    for source in (field, hio.bake(field, 0.2)):
+        answer = hio.query(source, lost, unknown=unknown)
+        assert (np.asarray(answer.sdf) < -1e29).all() and np.isfinite(answer.grad).all()
+        np.testing.assert_array_equal(hio.sdf(source, lost, unknown=unknown), answer.sdf)
+        assert (np.asarray(answer.lower) < -1e29).all()
+        assert (np.asarray(answer.frontier) < -1e29).all()
+
+
 def test_on_the_faces_of_the_box_the_gradient_is_that_of_the_inside(field):
     face, inside = np.array([3.0, -0.5, 1.0]), np.array([2.9999, -0.5, 1.0])
     np.testing.assert_allclose(
