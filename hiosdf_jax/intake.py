@@ -9,6 +9,8 @@ import numpy as np
 
 from hiosdf_jax.rigid import is_rigid
 
+_HASHED_EVERY = 64  # row of a cloud
+
 
 def check_shapes(cloud: Any, pose: Any) -> None:
     """Checks what is known of tracers as well.
@@ -56,21 +58,22 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
     if count <= capacity:
         padded[:count] = cloud
     else:
-        kept = _draw(finite, pose, capacity)
+        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
+        seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), zlib.crc32(pose.tobytes()))
+        kept = _draw(finite, seed, capacity)
         count = np.count_nonzero(kept)
         np.compress(kept, cloud, axis=0, out=padded[:count])
     padded[count:] = np.nan
     return padded, pose
 
 
-def _draw(finite: np.ndarray, pose: np.ndarray, capacity: int) -> np.ndarray:
+def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:
     """Marks `capacity` of the rows that are finite, or all if they are no more."""
     rows = np.flatnonzero(finite)
     dropped = len(rows) - capacity
     if dropped <= 0:
         return finite
-    # The draw must be a function of the arguments alone, and differ from cloud to cloud.
-    rng = np.random.default_rng(zlib.crc32(pose.tobytes(), len(rows)))
+    rng = np.random.default_rng(seed)
     fewer = min(capacity, dropped)
     chosen = rows[rng.choice(len(rows), fewer, replace=False, shuffle=False)]
     kept = finite.copy() if fewer == dropped else np.zeros_like(finite)

@@ -268,6 +268,20 @@ def test_rays_against_a_loop(hit):
     assert passes.sum() > 100
 
 
+def test_long_rays_go_on_from_step_to_step_of_the_loop(monkeypatch):
+    ends, sensor = uniform(7, 40, (0.1, 0.1, 0.3), (0.9, 0.9, 0.9)), np.array([0.0, 0.0, 0.25])
+    config = dataclasses.replace(CONFIG, voxel_size=0.02)
+    beams = beams_to(ends, sensor)
+    assert np.max(beams.free_ranges) / 0.02 > 60
+    once = rays.trace_rays(config, empty_grid(config), FIRST, beams)
+    for chunk in (5, 100):
+        monkeypatch.setattr(rays, "_CHUNK", chunk)
+        again = rays.trace_rays(config, empty_grid(config), FIRST, beams)
+        np.testing.assert_array_equal(again.passes, once.passes)
+    longest = np.sum(np.asarray(beams.free_ranges) / 0.02 - 1)
+    assert abs(float(once.passes.sum()) - longest) < len(ends)
+
+
 @pytest.mark.parametrize("sensor", [(0.31, 0.52, 0.63), (0.95, 0.95, 0.15), (1.0, 0.5, 0.6)])
 def test_the_window_around_the_sensor_is_all_that_a_cloud_changes(sensor):
     config = dataclasses.replace(CONFIG, max_range=0.15, voxel_size=0.05, min_range=0.0)
@@ -309,6 +323,26 @@ def test_evidence_fades_only_where_rays_come_by():
         grid = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), stored[-1])
     assert not same(stored[1].hits, stored[0].hits)
     assert same(stored[2], stored[1]) and same(stored[3], stored[1])
+
+
+def test_fading_against_its_definition():
+    rng = np.random.default_rng(4)
+    limit = CONFIG.evidence_limit
+    hits, passes, behind = (limit * rng.uniform(0, 1.5, SHAPE) for _ in range(3))
+    weight = rng.uniform(0.1, 5, SHAPE)
+    grid = empty_grid().replace(
+        hits=jnp.asarray(hits, jnp.float32),
+        passes=jnp.asarray(passes, jnp.float32),
+        behind=jnp.asarray(behind, jnp.float32),
+        weight=jnp.asarray(weight, jnp.float32),
+    )
+    faded = fade_evidence(CONFIG, grid)
+    scale = np.minimum(limit / (hits + passes), 1)
+    assert 0.1 < (scale < 1).mean() < 0.9
+    for name, exact in (("hits", hits), ("passes", passes), ("weight", weight)):
+        # Up to 0.07 % above the limit nothing is scaled.
+        np.testing.assert_allclose(getattr(faded, name), scale * exact, rtol=8e-4)
+    np.testing.assert_allclose(faded.behind, np.minimum(behind, limit), rtol=1e-6)
 
 
 def test_a_pose_of_few_digits_takes_no_ray_out_of_reach():
@@ -472,44 +506,72 @@ def test_a_sheet_seen_from_both_sides_is_free_on_both():
 
 
 @pytest.mark.parametrize(
-    ("voxel", "max_range", "horizons", "scale", "shapes"),
+    ("voxel", "max_range", "horizons", "box", "axis", "shapes"),
     [
-        (0.1, 0.5, (0.6, 0.4), 1.0, [41, 47]),
+        (0.1, 0.5, (0.6, 0.4), (6.0, 1.0, 1.0), 0, [41, 47]),
         # 2 + 0.8 + 0.4 + 0.2 + 0.4 m is, rounded, not more than 19 voxels of 0.2 m.
-        (0.2, 2.0, (0.4, 0.4), 4.0, [31, 41]),
+        (0.2, 2.0, (0.4, 0.4), (24.0, 4.0, 4.0), 0, [31, 41]),
+        # The two long axes tie in the small window, and not in the grid.
+        (0.1, 0.5, (0.6, 0.4), (6.0, 4.5, 1.0), 0, [41, 47]),
+        (0.1, 0.5, (0.6, 0.4), (1.0, 6.0, 1.0), 1, [41, 47]),
     ],
 )
-def test_a_window_gives_what_a_full_recomputation_gives(voxel, max_range, horizons, scale, shapes):
-    bounds = ((0.0, 0.0, 0.0), (6.0 * scale, scale, scale))
+def test_a_window_gives_what_a_full_recomputation_gives(
+    voxel, max_range, horizons, box, axis, shapes
+):
+    scale = max_range / 0.5
     small = dataclasses.replace(
         CONFIG,
         voxel_size=voxel,
-        bounds=bounds,
+        bounds=((0.0, 0.0, 0.0), box),
         max_range=max_range,
         distance_horizon=horizons[0],
         frontier_horizon=horizons[1],
     )
-    large = dataclasses.replace(small, max_range=50.0 * scale)
+    large = dataclasses.replace(small, max_range=100.0)
     grids, fits = [empty_grid(small), empty_grid(large), empty_grid(small)], set()
     for x, spread in ((0.5, 0.2), (2.0, 0.25), (3.3, 0.35), (2.2, 0.1), (0.9, 0.15)):
-        sensor = scale * np.array([x, 0.5, 0.5])
+        sensor = np.array(box) / 2
+        sensor[axis] = scale * x
         ends = sensor + scale * uniform(int(10 * x), 60, (-spread,) * 3, (spread,) * 3)
-        ends[:, 0] += 0.1 * scale
+        # Some look one way; none reaches farther than the range.
+        ends[:, axis] += scale * (spread + 0.05 if spread <= 0.2 else 0.1)
         ends = ends.astype(np.float32)
-        box = change.change_by(beams_to(ends, sensor))
-        half, whole, fit = change.windows(small, box, horizons[0])
-        assert [half.shape[0], whole.shape[0]] == shapes
+        cloud = change.change_by(beams_to(ends, sensor))
+        half, whole, fit = change.place_windows(small, cloud, horizons[0])
+        assert [half.shape[axis], whole.shape[axis]] == shapes
         fits.add(bool(fit))
-        boxes = (everywhere(sensor), everywhere(sensor), box)
+        changes = (everywhere(sensor), everywhere(sensor), cloud)
         for k, config in enumerate((small, large, small)):
             grid = fuse(grids[k], ends, sensor, config=config)
             grid = trace(grid, ends, sensor, config=config)
-            grid = update_distances(config, grid, boxes[k])
-            grids[k] = update_frontier(config, grid, boxes[k])
+            grid = update_distances(config, grid, changes[k])
+            grids[k] = update_frontier(config, grid, changes[k])
     assert fits == {True, False}
-    assert max(shapes) < small.grid_shape[0]
+    assert max(shapes) < small.grid_shape[axis]
     assert same(grids[0].surface, grids[1].surface)
     assert same(grids[2].surface, grids[1].surface)
+
+
+def test_the_small_window_is_for_rays_that_reach_half_the_range_along_no_axis():
+    sensor = np.array([0.23, 0.51, 0.62])
+    config = dataclasses.replace(CONFIG, bounds=((-3,) * 3, (3,) * 3), max_range=1.0)
+    for axis in range(3):
+        for reach, fits in ((0.9, True), (1.1, False)):
+            ends = np.tile(sensor, (5, 1)) + 0.01
+            ends[:, axis] += np.linspace(0.5, reach, 5)  # the sensor is outside the ends' box
+            cloud = change.change_by(beams_to(ends, sensor))
+            np.testing.assert_allclose(cloud.low_world, sensor, atol=1e-6)
+            small, large, fit = change.place_windows(config, cloud, 0.3)
+            assert bool(fit) is fits
+            window = small if fits else large
+            first, size = np.array(window.inner_start), np.array(window.inner_shape)
+            # All that lies within the horizon of the rays and of what they hide can change.
+            reach = 0.3 + 0.1 * rays.HIDDEN_VOXELS
+            assert (3 + cloud.low_world - reach >= 0.1 * first - 1e-6).all()
+            assert (3 + cloud.high_world + reach <= 0.1 * (first + size) + 1e-6).all()
+            assert (np.array(window.within) >= 3).all()
+            assert (np.add(window.within, size) + 3 <= window.shape).all()
 
 
 def test_an_empty_grid_answers_the_horizon():

@@ -425,6 +425,8 @@ def test_rows_are_drawn_from_the_whole_cloud(capacity):
     assert len(np.unique(rows)) == capacity
     other, _ = intake.prepare(cloud, at_height(1), capacity)
     assert not np.array_equal(drawn, other)
+    at_rest, _ = intake.prepare(cloud + np.float32([0, 0, 0.5]), at_height(0), capacity)
+    assert not np.array_equal(drawn[:, 0], at_rest[:, 0])
     again, _ = intake.prepare(cloud, at_height(0), capacity)
     np.testing.assert_array_equal(drawn, again)
 
@@ -446,12 +448,16 @@ def test_update_with_64_bit_numbers_enabled():
     code = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"
         "import dataclasses, numpy as np, hiosdf_jax as hio\n"
+        "from hiosdf_jax.grid import geometry\n"
         "from hiosdf_jax.network import tiles\n"
         "from room import CONFIG, stream\n"
         # Both windows of a change, and several tiles of the network's rows.
         "config = dataclasses.replace(CONFIG, bounds=((-9, -1, -1), (9, 1, 1)), batches=1,\n"
         "    max_range=2.0, near_samples=2000)\n"
-        "assert tiles.tile_count(2500) > 1\n"
+        "count = config.near_samples + config.far_samples\n"
+        "assert tiles.tile_count(count) > 1\n"
+        "shapes = [geometry.window_shape(config, share * 2.0 + 1.9) for share in (0.5, 1)]\n"
+        "assert shapes[0] != shapes[1]\n"
         "state = hio.update(hio.init(config, jax.random.key(0)), *stream(1)[0])\n"
         "assert np.isfinite(hio.sdf_and_grad(state, np.zeros((5, 3)))[1]).all()\n"
     )

@@ -189,6 +189,8 @@ def test_the_padding_of_a_gpus_tile_changes_nothing(monkeypatch, every):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float32)
     assert tiles.tile_index(60_000, 4).shape == (1, 60_416)
+    assert tiles.tile_index(60_000, 1000).shape == (1, 60_000)  # more padding than it is worth
+    monkeypatch.setattr(tiles, "_MOST_PADDING", 10)
     batch = training._split(config, samples, jax.random.key(0))
     assert batch.sdf.shape == (1, 1, 128 * every)
     padded, padded_losses, _ = train(config, network, samples, 2)

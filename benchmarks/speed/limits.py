@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from benchmarks.speed.rows import Row, single, time_ms
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid.change import Windows
+from hiosdf_jax.grid.change import Window
 from hiosdf_jax.network import passes
 
 
@@ -144,14 +144,14 @@ def nearest_work(queries: int, points: int) -> Work:
     return Work(vector=9.0 * queries * points, memory=12.0 * points + 16.0 * queries)
 
 
-def distance_work(windows: Windows) -> Work:
+def distance_work(window: Window) -> Work:
     """Of the distance transform's memory: the evidence read and the answers written once.
 
     Evidence: hits, passes, behind, mean (3) and axes (9) in float16, 30 bytes a voxel. Answers:
     nearest (3) in int8, sdf and doubt in float16, 7 bytes a voxel that can have changed. How many
     shifts the passes try depends on the map, so that operations are not counted.
     """
-    return Work(memory=30.0 * math.prod(windows.shape) + 7.0 * math.prod(windows.inner_shape))
+    return Work(memory=30.0 * math.prod(window.shape) + 7.0 * math.prod(window.inner_shape))
 
 
 def baked_work(points: int) -> Work:

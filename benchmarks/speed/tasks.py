@@ -23,7 +23,7 @@ from benchmarks.speed import baselines, limits, stages
 from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
 from hiosdf_jax import datasets, intake, mapping, served
 from hiosdf_jax.grid import geometry, lookup, surface
-from hiosdf_jax.grid.change import Windows, windows
+from hiosdf_jax.grid.change import Window, place_windows
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
 from hiosdf_jax.samples import Samples
@@ -250,7 +250,7 @@ def stage_rows(bench: Bench, label: str) -> list[Row]:
     queries = np.asarray(parts["local samples"].result.points_world)
     cloud, valid = np.asarray(cloud), np.asarray(valid)
     grid, change = parts["distance"].arguments
-    small, large, fits = windows(config, change, config.horizon_voxels * config.voxel_size)
+    small, large, fits = place_windows(config, change, config.horizon_voxels * config.voxel_size)
     searched = small if fits else large
     features, doubtful = _sites(config, grid, searched)
     work = {
@@ -468,9 +468,9 @@ def _take_apart(bench: Bench, label: str) -> dict[str, stages.Stage]:
     return stages.take_apart(state, *prepared)
 
 
-def _sites(config: hio.Config, grid: Any, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+def _sites(config: hio.Config, grid: Any, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """The voxels of the distance transform's window that its two searches look for."""
-    start, shape = windows.start, windows.shape
+    start, shape = window.start, window.shape
     hits, passes = (
         geometry.read_window(array, start, shape).astype(jnp.float32)
         for array in (grid.hits, grid.passes)

@@ -17,10 +17,10 @@ class Beams(NamedTuple):
 
     Attributes:
         points_world: (N, 3) m, where they end.
-        directions_world: (N, 3) unit vectors.
+        directions_world: (N, 3) unit vectors; 0 where there is no return.
         free_ranges: (N,) m, the part of them that counts as free.
-        in_range: (N,) bool, not nearer than min_range: those tell of free space.
-        ends: (N,) bool, and not farther than max_range: those tell of a surface.
+        in_range: (N,) bool, finite and not nearer than min_range: tell of free space.
+        ends: (N,) bool, in range and not farther than max_range: tell of a surface.
         inside: (N,) bool, end in the bounds.
         sensor_world: (3,) m, where they begin.
     """

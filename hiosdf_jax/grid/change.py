@@ -47,7 +47,7 @@ def change_by(beams: Beams) -> Change:
     return Change(sensor_world, jnp.minimum(low, sensor_world), jnp.maximum(high, sensor_world))
 
 
-class Windows(NamedTuple):
+class Window(NamedTuple):
     """Two boxes of voxels, one in the other: what is read, and what can have changed.
 
     Attributes:
@@ -68,9 +68,9 @@ class Windows(NamedTuple):
         return tuple(a - b for a, b in zip(self.inner_start, self.start, strict=True))
 
 
-def windows(
+def place_windows(
     config: Config, change: Change, horizon_m: float
-) -> tuple[Windows, Windows, jax.Array | bool]:
+) -> tuple[Window, Window, jax.Array]:
     """Places the windows in which something that reaches as far as a horizon is computed again.
 
     A voxel changes only within the horizon of new evidence, and what decides on it lies within the
@@ -84,16 +84,16 @@ def windows(
     Returns:
         small: Around the box of the rays.
         large: Around the sensor, for rays of any direction.
-        fits: () bool, whether the small ones will do.
+        fits: () bool, whether the small one will do.
     """
     hidden_m = rays.HIDDEN_VOXELS * config.voxel_size
 
-    def around(center_world: jax.Array, ray_reach_m: float) -> Windows:
+    def around(center_world: jax.Array, ray_reach_m: float) -> Window:
         changed_m = ray_reach_m + hidden_m + horizon_m + config.voxel_size
         # Half a voxel more, so that rounding takes none from the margin around what is written.
         shape = geometry.window_shape(config, changed_m + horizon_m + config.voxel_size / 2)
         inner_shape = geometry.window_shape(config, changed_m)
-        return Windows(
+        return Window(
             geometry.window_start(config, shape, center_world),
             shape,
             geometry.window_start(config, inner_shape, center_world),
@@ -103,26 +103,24 @@ def windows(
     large = around(change.sensor_world, config.max_range)
     small_reach_m = _SMALL * config.max_range
     small = around((change.low_world + change.high_world) / 2, small_reach_m)
-    if small.shape == large.shape:
-        return large, large, True
     return small, large, jnp.max(change.high_world - change.low_world) <= 2 * small_reach_m
 
 
 def recompute[T](
-    config: Config, change: Change, horizon_m: float, function: Callable[[Windows], T]
+    config: Config, change: Change, horizon_m: float, function: Callable[[Window], T]
 ) -> T:
-    """Computes something again where a cloud has changed it, in the smaller windows that will do.
+    """Computes something again where a cloud has changed it, in the smaller window that will do.
 
     Args:
         config: The map's configuration.
         change: Of the cloud.
         horizon_m: How far evidence reaches, a static number.
-        function: Computes it in windows.
+        function: Computes it in a window.
 
     Returns:
         What the function returns.
     """
-    small, large, fits = windows(config, change, horizon_m)
-    if small.shape == large.shape:
+    small, large, fits = place_windows(config, change, horizon_m)
+    if (small.shape, small.inner_shape) == (large.shape, large.inner_shape):
         return function(large)
     return jax.lax.cond(fits, lambda: function(small), lambda: function(large))

@@ -6,6 +6,7 @@ squared distance; the sites lie at their patch's centre, not at their voxel's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, surface
-from hiosdf_jax.grid.change import Change, Windows, recompute
+from hiosdf_jax.grid.change import Change, Window, recompute
 from hiosdf_jax.state import Grid, Surface
 
 NO_FEATURE = -128
@@ -51,7 +52,11 @@ class Part(NamedTuple):
 
 
 def nearest_sites(
-    sites: jax.Array, offset: jax.Array, horizon: int, part: Part | None = None
+    sites: jax.Array,
+    offset: jax.Array,
+    horizon: int,
+    part: Part | None = None,
+    order: Sequence[int] = (2, 1, 0),
 ) -> tuple[jax.Array, jax.Array]:
     """Finds each voxel's nearest site by exact passes over the axes.
 
@@ -60,6 +65,9 @@ def nearest_sites(
         offset: (X, Y, Z, 3) of the site from its voxel's centre, voxels, in [-0.5, 0.5].
         horizon: Sites farther than this along an axis are not looked for, voxels.
         part: The voxels to find them for; by default all.
+        order: Of the passes. Best first along the axis on which sites are nearest, as on that of
+            the floor and the ceiling: the others then need few shifts. Where sites lie off their
+            voxels' centres the answer can depend on it.
 
     Returns:
         nearest: (A, B, C) int32, the flat index of the nearest site's voxel; -1 where none is
@@ -69,8 +77,7 @@ def nearest_sites(
     start, shape = part or Part((0, 0, 0), sites.shape)
     nearest = jnp.arange(sites.size, dtype=jnp.int32).reshape(sites.shape)
     squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
-    # Short axes first: after a floor and a ceiling are known, the others need few shifts.
-    for axis in sorted(range(3), key=lambda k: sites.shape[k]):
+    for axis in order:
         # A voxel's candidate lies at some other place along this axis.
         along = offset[..., axis].ravel()[nearest.ravel()].reshape(nearest.shape)
         squared, shift = _pass(squared, along, axis, horizon, start[axis], shape[axis])
@@ -140,16 +147,16 @@ def update_distances(config: Config, grid: Grid, change: Change) -> Grid:
     """
     horizon_m = config.horizon_voxels * config.voxel_size
 
-    def inside(windows: Windows) -> Surface:
-        return _distances_in(config, grid, windows)
+    def inside(window: Window) -> Surface:
+        return _distances_in(config, grid, window)
 
     return grid.replace(surface=recompute(config, change, horizon_m, inside))
 
 
-def _distances_in(config: Config, grid: Grid, windows: Windows) -> Surface:
+def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
     """The grid's surface with new distances in windows that hold all new evidence."""
-    start, shape, inner_start, inner = windows
-    within = windows.within
+    start, shape, inner_start, inner = window
+    within = window.within
     part = Part(within, inner)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)
@@ -162,11 +169,13 @@ def _distances_in(config: Config, grid: Grid, windows: Windows) -> Surface:
         )
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
+    # Short axes first: of the grid, since all windows must give the same answer.
+    order = sorted(range(3), key=lambda k: config.grid_shape[k])
     features = surface.is_feature(config, hits, passes, axes)
-    nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part)
+    nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part, order)
     nearest = nearest.ravel()
     doubtful = surface.is_doubtful(hits, passes)
-    _, squared = nearest_sites(doubtful, mean, config.horizon_voxels, part)
+    _, squared = nearest_sites(doubtful, mean, config.horizon_voxels, part, order)
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
     free = is_free(passes, behind)
     flat_mean, flat_axes = mean.reshape(-1, 3), axes.reshape(-1, 3, 3)

@@ -13,7 +13,7 @@ from hiosdf_jax.state import Grid, Surface
 # Half the memory, and finer than the noise.
 _STORED = jnp.float16
 
-# Two such numbers are at most so much larger than what they were rounded from.
+# Such numbers are at most 1 + 2^-11 = 1.0005 times what they were rounded from.
 _ROUNDING = 1.0007
 
 
@@ -76,8 +76,8 @@ def fade_evidence(config: Config, window: Grid) -> Grid:
     # so that nothing fades where no ray comes by.
     hits, passes = (_rounded(counts) for counts in (window.hits, window.passes))
     above = hits + passes > _ROUNDING * config.evidence_limit
-    rays = jnp.maximum(window.hits + window.passes, 1)
-    scale = jnp.where(above, config.evidence_limit / rays, 1)
+    total = jnp.maximum(window.hits + window.passes, 1)
+    scale = jnp.where(above, config.evidence_limit / total, 1)
     return window.replace(
         hits=window.hits * scale,
         weight=window.weight * scale,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, lookup
-from hiosdf_jax.grid.change import Change, Windows, recompute
+from hiosdf_jax.grid.change import Change, Window, recompute
 from hiosdf_jax.state import Grid
 
 _INFINITE = 1e12  # squared voxels
@@ -69,16 +69,16 @@ def update_frontier(config: Config, grid: Grid, change: Change) -> Grid:
     """
     horizon_m = config.frontier_voxels * config.voxel_size
 
-    def inside(windows: Windows) -> jax.Array:
-        return _frontier_in(config, grid, windows)
+    def inside(window: Window) -> jax.Array:
+        return _frontier_in(config, grid, window)
 
     frontier = recompute(config, change, horizon_m, inside)
     return grid.replace(surface=grid.surface.replace(frontier=frontier))
 
 
-def _frontier_in(config: Config, grid: Grid, windows: Windows) -> jax.Array:
+def _frontier_in(config: Config, grid: Grid, window: Window) -> jax.Array:
     """The grid's frontier, new in windows that hold all new evidence."""
-    start, shape, inner_start, inner = windows
+    start, shape, inner_start, inner = window
     seen = lookup.observed(
         geometry.read_window(grid.passes, start, shape),
         geometry.read_window(grid.hits, start, shape),
@@ -89,7 +89,7 @@ def _frontier_in(config: Config, grid: Grid, windows: Windows) -> jax.Array:
         border = jnp.minimum(index, config.grid_shape[axis] - 1 - index) + 0.5
         distance = jnp.where(seen, jnp.minimum(distance, border), distance)
 
-    metres = geometry.read_window(distance * config.voxel_size, windows.within, inner)
+    metres = geometry.read_window(distance * config.voxel_size, window.within, inner)
     # Rounded down: never farther than it is.
     steps = (
         jnp.floor(metres / geometry.frontier_step_m(config))

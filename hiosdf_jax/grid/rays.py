@@ -25,7 +25,8 @@ _BEHIND_STEPS = 3
 HIDDEN_VOXELS = _BEHIND_STEPS + 1
 """Rays change nothing farther behind their ends."""
 
-# Steps a loop iteration makes: few, large kernels, since a GPU waits for the host at each end.
+# Steps a loop iteration makes: few, large kernels, since a GPU waits for the host at each end, and
+# so many points of every ray are in its memory at once.
 _CHUNK = 32
 
 

@@ -19,6 +19,7 @@ _ROWS = 1024
 # XLA sums the gradient of a weight over up to so many parts of a tile at once on a GPU; where the
 # rows do not divide it copies all activations to pad them, a sixth of the time of a training step.
 _PARTS = 128
+_MOST_PADDING = 1.02  # more rows than that cost more than the copies
 
 
 def tile_count(rows: int) -> int:
@@ -31,7 +32,8 @@ def tile_index(rows: int, groups: int) -> np.ndarray:
 
     Args:
         rows: How many there are.
-        groups: A tile will be divided into so many equal parts, some of them treated alike.
+        groups: One row in so many is treated in another way than the rest of its tile, each of
+            the two shares at once.
 
     Returns:
         (tiles, K) int; numbers from `rows` on are padding.
@@ -39,7 +41,8 @@ def tile_index(rows: int, groups: int) -> np.ndarray:
     tiles = max(tile_count(rows), 1)
     size = -(-rows // tiles)
     if jax.default_backend() != "cpu":
-        size = -(-size // (groups * _PARTS)) * groups * _PARTS
+        padded = -(-size // (groups * _PARTS)) * groups * _PARTS
+        size = padded if padded <= _MOST_PADDING * size else size
     return np.arange(size * tiles).reshape(-1, tiles).T
 
 
