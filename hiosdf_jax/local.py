@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid.surface import safe_norm
+from hiosdf_jax.grid.geometry import safe_norm
 from hiosdf_jax.samples import Samples, draw_from_mask
 
 # Pairs of query and cloud point that are looked at together: bounds the memory.

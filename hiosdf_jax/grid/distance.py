@@ -187,7 +187,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
         jump = jnp.stack(jnp.unravel_index(row, shape)) - here
         patch_axes = flat_axes[row].astype(jnp.float32)
         offset = surface.patch_offset(jnp.zeros(3, jnp.float32), flat_mean[row] + jump, patch_axes)
-        distance = surface.safe_norm(offset)
+        distance = geometry.safe_norm(offset)
         side = _side(free, behind, here, offset, distance, patch_axes)
         found = nearest[voxel] >= 0
         sdf = jnp.where(found, side * distance * config.voxel_size, config.distance_horizon)
@@ -245,7 +245,7 @@ def _side(
     Returns:
         () float32.
     """
-    length = surface.safe_norm(axes)
+    length = geometry.safe_norm(axes)
     flat = length[2] < 0.5 * length[1]
     normal = axes[2] / jnp.maximum(length[2], 1e-6)
     in_front = jnp.dot(offset, normal, precision="highest") >= 0

@@ -71,7 +71,7 @@ def nearest_patch(config: Config, known: Surface, points_world: jax.Array) -> Ne
     first_world = geometry.voxel_center(config, first)
     point = (points_world[..., None, :] - first_world) / config.voxel_size
     offset = surface.patch_offset(point, mean + (site - first), axes)
-    distance = jnp.where(found, surface.safe_norm(offset), jnp.inf)
+    distance = jnp.where(found, geometry.safe_norm(offset), jnp.inf)
     any_found = jnp.any(found, axis=-1)
     metres = jnp.where(any_found, jnp.min(distance, axis=-1), 0) * config.voxel_size
     # Voxels without a feature have no side: those that `grow` adds must not change old answers.
@@ -79,7 +79,7 @@ def nearest_patch(config: Config, known: Surface, points_world: jax.Array) -> Ne
     side = jnp.sum(jnp.where(found, signed * corners.weight, 0), axis=-1)
     closest = jnp.argmin(distance, axis=-1)[..., None, None]
     normal = jnp.take_along_axis(axes[..., 2, :], closest, axis=-2)[..., 0, :]
-    spread = jnp.where(any_found, surface.safe_norm(normal) * config.voxel_size, 0)
+    spread = jnp.where(any_found, geometry.safe_norm(normal) * config.voxel_size, 0)
     return Nearest(
         jnp.where(any_found, jnp.where(side < 0, -metres, metres), config.distance_horizon),
         jax.lax.stop_gradient(spread),

@@ -67,7 +67,7 @@ def fuse_hits(
     target = jnp.full(count, voxels, voxel.dtype).at[group].set(voxel)
     used = (voxel < voxels).astype(jnp.float32)
 
-    ranges = safe_norm(points_world[order] - sensor_world)
+    ranges = geometry.safe_norm(points_world[order] - sensor_world)
     noise_floor, noise_growth = config.range_noise
     weight = used / (1 + noise_growth / noise_floor * ranges**2) ** 2
     offset = jnp.where(used[:, None] > 0, offset, 0)
@@ -212,10 +212,3 @@ def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     order = jnp.argsort(-value, axis=-1)
     deviation = jnp.sqrt(jnp.maximum(jnp.take_along_axis(value, order, axis=-1), 0))
     return deviation, jnp.take_along_axis(vector, order[..., None], axis=-2)
-
-
-def safe_norm(vectors: jax.Array) -> jax.Array:
-    """Length of (..., 3) vectors, with gradient 0 instead of NaN at 0."""
-    square = jnp.sum(vectors * vectors, axis=-1)
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
