@@ -118,7 +118,7 @@ def _draw_slices(
     turn = world_from_level.T.astype(np.float32)  # of rows
     view.save_slices(
         file,
-        lambda points: _sdf(field, points @ turn),
+        lambda points: sdf(field, points @ turn),
         None if exact_sdf is None else lambda points: exact_sdf(points @ turn),
         bounds,
         slice_heights(float(np.median(path[:, 2])), float(low), float(high)),
@@ -159,6 +159,5 @@ def _write_mesh(folder: Path, surface: trimesh.Trimesh, up_world: np.ndarray) ->
     view.save_shaded(picture, smooth, up_world=up_world.tolist())
 
 
-# The map is an argument, so that these compile once for maps of one configuration.
-_sdf = jax.jit(sdf)
+# The map is an argument, so that this compiles once for maps of one configuration.
 _observed = jax.jit(lambda field, points: query(field, points).observed)

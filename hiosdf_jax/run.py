@@ -20,7 +20,7 @@ import numpy as np
 from hiosdf_jax import checkpoint, drawing, evaluation, mapping
 from hiosdf_jax.config import Config
 from hiosdf_jax.datasets.stream import BadFrameError, Stream, read_frame
-from hiosdf_jax.query import query, sdf_and_grad
+from hiosdf_jax.query import query, sdf, sdf_and_grad
 from hiosdf_jax.state import Field, Flag, MapState
 
 # Of a stream without ground truth the map is not given every tenth frame, once it has seen some.
@@ -124,7 +124,7 @@ def run_stream(
     if truth is not None:
         for name, score in (("scores", evaluation.evaluate), ("bands", evaluation.evaluate_bands)):
             metrics[name] = score(
-                lambda points: _sdf_and_grad(field, points),
+                lambda points: sdf_and_grad(field, points),
                 truth,
                 sensor_position_world=mapped.path_world[-1],
                 last_frame=mapped.last_frame,
@@ -324,11 +324,11 @@ def _score_held_out(field: Field, points_world: np.ndarray) -> dict[str, float]:
     """Scores a map on returns that it was not given, where it has seen the place."""
     if not len(points_world):
         return {"points": 0, "points_observed": 0}
-    observed = np.asarray(_observed(field, points_world))  # False outside the bounds
+    observed = np.asarray(query(field, points_world).observed)  # False outside the bounds
     scores: dict[str, float] = {"points": len(points_world), "points_observed": int(observed.sum())}
     if observed.any():
         scores |= evaluation.held_out_surface(
-            lambda points: _sdf_and_grad(field, points)[0], points_world[observed]
+            lambda points: sdf(field, points), points_world[observed]
         )
     return scores
 
@@ -359,7 +359,5 @@ def _summary(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# The map is an argument, so that these compile once for maps of one configuration.
-_sdf_and_grad = jax.jit(sdf_and_grad)
-_observed = jax.jit(lambda field, points: query(field, points).observed)
+# The map is an argument, so that this compiles once for maps of one configuration.
 _lower = jax.jit(lambda field, points: query(field, points).lower)
