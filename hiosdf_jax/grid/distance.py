@@ -154,7 +154,7 @@ def update_distances(config: Config, grid: Grid, change: Change) -> Grid:
 
 
 def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
-    """The grid's surface with new distances in windows that hold all new evidence."""
+    """The grid's surface with new distances in a window that holds all they can depend on."""
     start, shape, inner_start, inner = window
     within = window.within
     part = Part(within, inner)

@@ -77,7 +77,7 @@ def update_frontier(config: Config, grid: Grid, change: Change) -> Grid:
 
 
 def _frontier_in(config: Config, grid: Grid, window: Window) -> jax.Array:
-    """The grid's frontier, new in windows that hold all new evidence."""
+    """The grid's frontier, new in a window that holds all it can depend on."""
     start, shape, inner_start, inner = window
     seen = lookup.observed(
         geometry.read_window(grid.passes, start, shape),
