@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.gradient import value_and_gradient
+from hiosdf_jax.gradient import least, value_and_gradient
 from hiosdf_jax.grid import geometry, surface
 from hiosdf_jax.grid.distance import NO_FEATURE
 from hiosdf_jax.state import Surface
@@ -73,7 +73,7 @@ def nearest_patch(config: Config, known: Surface, points_world: jax.Array) -> Ne
     offset = surface.patch_offset(point, mean + (site - first), axes)
     distance = jnp.where(found, geometry.safe_norm(offset), jnp.inf)
     any_found = jnp.any(found, axis=-1)
-    metres = jnp.where(any_found, jnp.min(distance, axis=-1), 0) * config.voxel_size
+    metres = jnp.where(any_found, least(distance), 0) * config.voxel_size
     # Voxels without a feature have no side: those that `grow` adds must not change old answers.
     signed = known.sdf.ravel()[corners.flat].astype(jnp.float32)
     side = jnp.sum(jnp.where(found, signed * corners.weight, 0), axis=-1)

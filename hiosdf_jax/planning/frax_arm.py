@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax.gradient import value_and_gradient
+from hiosdf_jax.gradient import least, value_and_gradient
 from hiosdf_jax.planning.clearance import sphere_clearance
 from hiosdf_jax.query import AnyField, Unknown
 
@@ -70,7 +70,7 @@ def arm_clearance(
         ValueError: An argument is not what it should be.
     """
     centers_world, radii = arm_spheres(arm, q, pose_world_base)
-    return jnp.min(sphere_clearance(field, centers_world, radii, unknown), axis=-1)
+    return least(sphere_clearance(field, centers_world, radii, unknown))
 
 
 def arm_clearance_and_grad(

@@ -15,6 +15,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax.gradient import least
 from hiosdf_jax.planning import cover, solids
 from hiosdf_jax.planning.clearance import sphere_clearance
 from hiosdf_jax.query import AnyField, Unknown
@@ -141,7 +142,7 @@ def robot_clearance(
         ValueError: As for `place_spheres` and `sphere_clearance`.
     """
     centers_world = place_spheres(spheres, data)
-    return jnp.min(sphere_clearance(field, centers_world, spheres.radii, unknown), axis=-1)
+    return least(sphere_clearance(field, centers_world, spheres.radii, unknown))
 
 
 def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:

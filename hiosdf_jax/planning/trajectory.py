@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from hiosdf_jax.gradient import least
 from hiosdf_jax.query import AnyField, Unknown, sdf_and_grad
 
 # Points at which each segment is held off the map; the last one is its end.
@@ -125,7 +126,7 @@ def optimize_trajectory(
         return (jnp.asarray(optax.apply_updates(path, update)), memory), None
 
     (path, _), _ = jax.lax.scan(step, (initial, adam.init(initial)), length=steps)
-    clearance = jnp.min(sdf_and_grad(field, _along(path), unknown)[0], axis=-1) - radius_m
+    clearance = least(sdf_and_grad(field, _along(path), unknown)[0]) - radius_m
     return Trajectory(path, clearance, jnp.sum(_length(jnp.diff(path, axis=-2)), axis=-1))
 
 
