@@ -1,14 +1,8 @@
-"""Derivatives of functions of points that hold wherever they are compiled.
-
-`jnp.minimum`, `jnp.clip`, `jnp.min` and their like ask, for their derivative, which argument equals
-the result. A compiler may compute an argument again for that and round it in another way; then
-none is equal, and the derivative is 0. What is here asks which one is smaller: there always is one.
-"""
+"""Derivatives of functions of points, for a whole batch at once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,54 +24,17 @@ def value_and_gradient(
     return value, pull(jnp.ones_like(value))[0]
 
 
-def lesser(first: Any, second: Any) -> jax.Array:
-    """Elementwise minimum; where both are equal, the derivative is the second's.
-
-    Args:
-        first: (...).
-        second: (...), of a shape that broadcasts with the first's.
-
-    Returns:
-        (...).
-    """
-    return jnp.where(first < second, first, second)
-
-
-def greater(first: Any, second: Any) -> jax.Array:
-    """Elementwise maximum; where both are equal, the derivative is the second's.
-
-    Args:
-        first: (...).
-        second: (...), of a shape that broadcasts with the first's.
-
-    Returns:
-        (...).
-    """
-    return jnp.where(first > second, first, second)
-
-
-def limit(values: jax.Array, low: Any, high: Any) -> jax.Array:
-    """Moves values outside an interval to its nearer end; on the ends the derivative is 1.
-
-    Args:
-        values: (...); a NaN stays one.
-        low: The least that is returned; of a shape that broadcasts with the values'.
-        high: The largest.
-
-    Returns:
-        (...).
-    """
-    return jnp.where(values < low, low, jnp.where(values > high, high, values))
-
-
 def least(values: jax.Array) -> jax.Array:
-    """Minimum along the last axis; of several that are equal, the derivative is the first's.
+    """Minimum along the last axis, with a derivative that holds however it is compiled.
+
+    That of `jnp.min` asks which of the values equal the least. A compiler may compute the values
+    again for that, rounded in another way; then none is equal, and the derivative is 0.
 
     Args:
         values: (..., N), N > 0.
 
     Returns:
-        (...).
+        (...). Of several that are equal, the derivative is the first's.
     """
     chosen = jnp.arange(values.shape[-1]) == jnp.argmin(values, axis=-1)[..., None]
     return jnp.sum(jnp.where(chosen, values, 0), axis=-1)

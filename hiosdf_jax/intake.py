@@ -47,8 +47,8 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
     if not is_rigid(pose, np):
         raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
-    finite = np.isfinite(cloud)
-    finite = finite[:, 0] & finite[:, 1] & finite[:, 2]  # several times faster than all(axis=1)
+    x, y, z = cloud.T  # column by column: many times faster than all(axis=1)
+    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     if not finite.any():
         raise ValueError(
             f"cloud has no finite row among its {len(cloud)}, expected at least one return"
@@ -60,22 +60,24 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
     else:
         # The draw must be a function of the arguments alone, and differ from cloud to cloud.
         seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), zlib.crc32(pose.tobytes()))
-        kept = _draw(finite, seed, capacity)
-        count = np.count_nonzero(kept)
-        np.compress(kept, cloud, axis=0, out=padded[:count])
+        rows = _draw(finite, seed, capacity)
+        count = len(rows)
+        np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" takes a copy more
     padded[count:] = np.nan
     return padded, pose
 
 
 def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:
-    """Marks `capacity` of the rows that are finite, or all if they are no more."""
+    """Indices of `capacity` of the rows that are finite, or of all if they are no more."""
     rows = np.flatnonzero(finite)
     dropped = len(rows) - capacity
     if dropped <= 0:
-        return finite
+        return rows
     rng = np.random.default_rng(seed)
+    # With repetitions, until enough are different: of those to keep or of those to drop, whichever
+    # are fewer. A permutation would touch every row of a large cloud.
     fewer = min(capacity, dropped)
-    chosen = rows[rng.choice(len(rows), fewer, replace=False, shuffle=False)]
-    kept = finite.copy() if fewer == dropped else np.zeros_like(finite)
-    kept[chosen] = fewer != dropped  # chosen are those to drop, or those to keep
-    return kept
+    chosen = np.zeros(len(rows), bool)
+    while missing := fewer - np.count_nonzero(chosen):
+        chosen[rng.integers(len(rows), size=missing)] = True
+    return rows[np.flatnonzero(chosen if fewer == capacity else ~chosen)]

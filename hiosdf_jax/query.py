@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax import lattice, served, uncertainty
-from hiosdf_jax.gradient import lesser, limit, value_and_gradient
-from hiosdf_jax.grid import lookup
+from hiosdf_jax.gradient import value_and_gradient
+from hiosdf_jax.grid import geometry, lookup
 from hiosdf_jax.state import Baked, Field, MapState, Query
 
 _FAR = 1e30  # m
@@ -142,7 +142,7 @@ def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown) -> jax.
     # A point that is no point is nowhere safe: as deep inside as others are far outside.
     nowhere = jnp.any(jnp.isnan(points), axis=-1)
     value = value + jnp.where(nowhere, -beyond, beyond)
-    return value if unknown == "network" else lesser(value, _frontier(field, points))
+    return value if unknown == "network" else jnp.minimum(value, _frontier(field, points))
 
 
 def _frontier(field: Field | Baked, points: jax.Array) -> jax.Array:
@@ -152,7 +152,7 @@ def _frontier(field: Field | Baked, points: jax.Array) -> jax.Array:
     else:
         value = lookup.frontier(field.config, field.surface, inside)
     # Nothing outside the bounds has been seen, and the bounds themselves are the last of what has.
-    return jnp.where(beyond > 0, lesser(value, 0) - beyond, value)
+    return jnp.where(beyond > 0, jnp.minimum(value, 0) - beyond, value)
 
 
 def _split(field: Field | Baked, points: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -160,7 +160,7 @@ def _split(field: Field | Baked, points: jax.Array) -> tuple[jax.Array, jax.Arra
     low, high = lattice.bounds(field) if isinstance(field, Baked) else field.config.bounds
     low, high = jnp.asarray(low, points.dtype), jnp.asarray(high, points.dtype)
     points = jnp.where(jnp.isnan(points), _FAR, points)
-    nearest = limit(points, low, high)
+    nearest = geometry.clip_to_box(points, low, high)
     beyond = points - nearest
     # Scaled by the largest component, since the square of a far point would overflow.
     scale = jnp.maximum(jnp.max(jnp.abs(jax.lax.stop_gradient(beyond)), axis=-1), 1e-6)
@@ -176,4 +176,4 @@ def _checked(points: Any, unknown: Any) -> jax.Array:
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points has shape {points.shape}, expected (..., 3)")
     # Infinite points are taken as very far ones: inf - inf would be NaN.
-    return limit(points.astype(jnp.float32), -_FAR, _FAR)
+    return jnp.clip(points.astype(jnp.float32), -_FAR, _FAR)

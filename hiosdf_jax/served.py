@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.gradient import greater, lesser, limit, value_and_gradient
+from hiosdf_jax.gradient import value_and_gradient
 from hiosdf_jax.grid import lookup
 from hiosdf_jax.network import siren
 from hiosdf_jax.state import Field
@@ -95,25 +95,25 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     config = field.config
     nearest = lookup.nearest_patch(config, field.surface, points_world)
     network = network_sdf(field, points_world)
-    largest = _LARGEST_CORRECTION_VOXELS * config.voxel_size
-    gap = lesser(jnp.abs(network - nearest.sdf), largest)
+    limit = _LARGEST_CORRECTION_VOXELS * config.voxel_size
+    gap = jnp.minimum(jnp.abs(network - nearest.sdf), limit)
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
     doubt = lookup.doubt(config, field.surface, points_world)
     frontier = lookup.frontier(config, field.surface, points_world)
-    cautious = lesser(_combine(config, nearest.sdf, network, frontier), doubt)
+    cautious = jnp.minimum(_combine(config, nearest.sdf, network, frontier), doubt)
     # What has not been seen may hide a surface that is nearer than all that were.
-    hidden = greater(frontier, cautious - _HIDDEN_VOXELS * config.voxel_size)
-    return lesser(cautious, hidden), scale
+    hidden = jnp.maximum(frontier, cautious - _HIDDEN_VOXELS * config.voxel_size)
+    return jnp.minimum(cautious, hidden), scale
 
 
 def _combine(config: Config, grid: jax.Array, network: jax.Array, frontier: jax.Array) -> jax.Array:
     if config.grid_share == 0:
         return network
     # No more than the distance itself: surfaces stay where the grid has them, thin ones too.
-    largest = lesser(_LARGEST_CORRECTION_VOXELS * config.voxel_size, jnp.abs(grid))
-    near = grid + (1 - config.grid_share) * limit(network - grid, -largest, largest)
+    limit = jnp.minimum(_LARGEST_CORRECTION_VOXELS * config.voxel_size, jnp.abs(grid))
+    near = grid + (1 - config.grid_share) * jnp.clip(network - grid, -limit, limit)
     start, end = (share * config.distance_horizon for share in _FADE)
-    far = limit((jnp.abs(grid) - start) / (end - start), 0, 1)
+    far = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)
     start, end = (voxels * config.voxel_size for voxels in _FADE_UNSEEN_VOXELS)
-    unseen = limit((-frontier - start) / (end - start), 0, 1)
-    return near + greater(far, unseen) * (network - near)
+    unseen = jnp.clip((-frontier - start) / (end - start), 0, 1)
+    return near + jnp.maximum(far, unseen) * (network - near)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import panda_clearance as example
 import pytest
-from analytic import baked, count_traces, half_space, half_spaces
+from analytic import baked, count_traces, equalities_with_least, half_space, half_spaces
 from scene import ROOM, exact_sdf
 
 with warnings.catch_warnings():
@@ -90,6 +90,9 @@ def test_clearance_and_gradient_of_200_maps_with_one_compilation(panda):
             checked += 1
     assert len(traces) == 1
     assert checked == 60
+    assert (
+        equalities_with_least(lambda q: arm_clearance(fields[0], panda, q), jnp.asarray(q[0])) == 0
+    )
     assert (np.abs(clearances[::2] - clearances[1::2]) > 0.01).mean() > 0.9
 
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from analytic import equalities_with_least
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco import mjx
@@ -362,6 +363,7 @@ def test_a_robots_clearance_and_its_gradient_through_mjx(model, spheres):
         ]
         np.testing.assert_allclose(slopes[:, axis], numeric, atol=2e-4)
     assert np.abs(slopes).max() > 0.1
+    assert equalities_with_least(lambda q: clearance(field, q), jnp.asarray(CONFIGURATIONS[0])) == 0
 
 
 def test_bad_poses_are_named(model, spheres):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trajectory as example
-from analytic import baked, count_traces, half_space, half_spaces
+from analytic import baked, count_traces, equalities_with_least, half_space, half_spaces
 from scene import ROOM, exact_sdf
 
 from hiosdf_jax.planning.trajectory import optimize_trajectory, waves
@@ -104,6 +104,7 @@ def test_200_maps_compile_once_and_the_path_reacts():
         middles.append(np.asarray(paths.waypoints_world[0, 6]))
     assert len(traces) == 1
     assert (np.linalg.norm(np.diff(middles, axis=0), axis=1) > 0.02).mean() > 0.8
+    assert equalities_with_least(lambda path: counted(fields[0], path).clearance, guess) == 0
 
 
 def test_it_finds_ways_through_the_room():

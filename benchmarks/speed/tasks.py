@@ -360,6 +360,8 @@ def cloud_size_rows(bench: Bench) -> list[Row]:
     _call_all(updates.values())
     rows = []
     for name, update in tqdm(updates.items(), desc="cloud sizes", leave=False):
+        if bench.out_of_time():
+            return [*rows, Row(name, note=OUT_OF_TIME)]
         rows.append(Row(name, "ms", time_ms(update, seconds=bench.sizes.seconds)))
     return rows
 
@@ -379,6 +381,8 @@ def map_size_rows(bench: Bench) -> list[Row]:
     )
     rows, first = [], next(iter(configs))
     for name, config in tqdm(configs.items(), desc="map sizes", leave=False):
+        if bench.out_of_time():
+            return [*rows, Row(f"update, light, {name}", note=OUT_OF_TIME)]
         state, _, _ = _map_frames(bench, config, 5)
         update = functools.partial(hio.update, state)
         spread = time_ms(update, *bench.frame(5), seconds=bench.sizes.seconds)

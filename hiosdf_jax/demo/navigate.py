@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import jax_mppi  # pyright: ignore[reportMissingImports]
 import numpy as np
 
+from hiosdf_jax.gradient import least
 from hiosdf_jax.planning import mppi
 from hiosdf_jax.query import AnyField, Unknown, query, sdf
 
@@ -204,7 +205,7 @@ def clearance(robot: Robot, field: AnyField, states: jax.Array, unknown: Unknown
     Returns:
         (...) m.
     """
-    return jnp.min(sdf(field, body(robot, states), unknown), axis=-1) - robot.radius
+    return least(sdf(field, body(robot, states), unknown)) - robot.radius
 
 
 def body(robot: Robot, states: Any) -> jax.Array:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.gradient import limit
 
 FRONTIER_STEPS = 127
 """`Surface.frontier` counts steps, so many to the horizon."""
@@ -131,7 +130,15 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
 def clamp(config: Config, points_world: jax.Array) -> jax.Array:
     """Moves (..., 3) points outside the bounds, m, to the nearest point of the box."""
     low, high = jnp.asarray(config.bounds, points_world.dtype)
-    return limit(points_world, low, high)
+    return clip_to_box(points_world, low, high)
+
+
+def clip_to_box(points: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Moves (..., 3) points outside a box to its nearest point.
+
+    Unlike jnp.clip, which halves the gradient on the faces.
+    """
+    return jnp.where(points < low, low, jnp.where(points > high, high, points))
 
 
 def window_shape(config: Config, reach: float) -> tuple[int, int, int]:

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.gradient import limit
 from hiosdf_jax.grid import geometry
 from hiosdf_jax.state import Grid
 
@@ -170,7 +169,7 @@ def patch_offset(point: jax.Array, mean: jax.Array, axes: jax.Array) -> jax.Arra
     for k in range(2):
         half = _EXTENT_DEVIATIONS * axes[..., k, :]
         square = jnp.maximum(jnp.sum(half * half, axis=-1), 1e-12)
-        along = limit(jnp.sum(offset * half, axis=-1) / square, -1, 1)
+        along = jnp.clip(jnp.sum(offset * half, axis=-1) / square, -1, 1)
         offset = offset - along[..., None] * half
     return offset
 

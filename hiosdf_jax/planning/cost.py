@@ -9,8 +9,6 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax.gradient import greater, limit
-
 
 def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
     """The obstacle cost of CHOMP (Zucker et al., IJRR 2013): smooth, zero beyond a margin.
@@ -34,5 +32,5 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
             raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite")
     clearance, margin = jnp.asarray(clearance, jnp.float32), jnp.asarray(margin_m, jnp.float32)
     # Clipped before it is squared: an infinite clearance must not make the gradient NaN.
-    shortfall = limit(margin - clearance, 0, margin)
-    return shortfall**2 / (2 * margin) + greater(-clearance, 0)
+    shortfall = jnp.clip(margin - clearance, 0, margin)
+    return shortfall**2 / (2 * margin) + jnp.maximum(-clearance, 0)

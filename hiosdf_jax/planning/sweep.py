@@ -19,7 +19,6 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax.gradient import lesser, limit
 from hiosdf_jax.planning.clearance import checked_radii
 from hiosdf_jax.query import AnyField, Unknown, as_field, sdf
 
@@ -74,7 +73,8 @@ def swept_clearance(
     if not isinstance(slope, jax.core.Tracer) and not (math.isfinite(slope) and slope > 0):
         raise ValueError(f"slope is {slope}, expected > 0 and finite")
     start, end = (
-        limit(jnp.asarray(points, jnp.float32), -_FAR, _FAR) for points in (start_world, end_world)
+        jnp.clip(jnp.asarray(points, jnp.float32), -_FAR, _FAR)
+        for points in (start_world, end_world)
     )
     slope = jnp.asarray(slope, jnp.float32)
     answering = as_field(field)
@@ -129,7 +129,7 @@ def _lowest_segment(
 def _bound(first: jax.Array, last: jax.Array, width: jax.Array, slope: jax.Array) -> jax.Array:
     # Where the field is steeper than it should be, the cones from the ends meet outside the
     # segment: the bound is then no more than the lower end.
-    return lesser((first + last - slope * width) / 2, lesser(first, last))
+    return jnp.minimum((first + last - slope * width) / 2, jnp.minimum(first, last))
 
 
 def _length(way: jax.Array) -> jax.Array:
