@@ -13,6 +13,9 @@ Bounds = tuple[Point, Point]
 # Bounds given as multiples of the voxel size must not gain a voxel from rounding (0.3 / 0.1 < 3).
 _LATTICE_TOLERANCE_VOXELS = 1e-4
 
+# The nine numbers of the voxels' principal axes are counted by 32 bits; such a map has 19 GB.
+_MOST_VOXELS = 2**32 // 9
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -148,10 +151,10 @@ class Config:
                 f"Config.bounds is {self.bounds!r}, expected a box that holds voxels of "
                 f"{self.voxel_size} m"
             )
-        if voxels > 2**31 - 1:
+        if voxels > _MOST_VOXELS:
             raise ValueError(
                 f"Config.bounds is {self.bounds!r}: {voxels} voxels of {self.voxel_size} m, "
-                f"expected fewer than 2^31"
+                f"expected at most {_MOST_VOXELS}"
             )
 
     @classmethod

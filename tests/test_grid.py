@@ -24,6 +24,7 @@ from hiosdf_jax.grid import (
     surface,
 )
 from hiosdf_jax.grid.beams import Beams, place_cloud
+from hiosdf_jax.grid.vectors import join, split
 from hiosdf_jax.rigid import is_rigid
 from hiosdf_jax.samples import draw_from_mask
 
@@ -109,10 +110,10 @@ def test_voxel_and_offset_do_not_depend_on_the_bounds():
 def test_corners_interpolate_affine_functions_exactly_and_know_the_border():
     points = uniform(2, 300)
     corners = geometry.corners_of(CONFIG, points)
-    centers = geometry.voxel_center(CONFIG, corners.index)
+    centers = geometry.voxel_center(CONFIG, join(corners.index))
     between = np.sum(centers * np.asarray(corners.weight)[..., None], axis=-2)
     np.testing.assert_allclose(between, points, atol=1e-6)
-    index = np.asarray(corners.index)
+    index = np.stack(corners.index, axis=-1)
     inside = np.all((index >= 0) & (index < SHAPE), axis=-1)
     assert 50 < np.sum(~inside.all(axis=1)) < 299
     np.testing.assert_array_equal(corners.inside, inside)
@@ -219,7 +220,10 @@ def test_patch_offset_against_a_dense_rectangle(seed, half):
         -1, 3
     )
     nearest = np.linalg.norm(rectangle - point, axis=1).min()
-    offset = surface.patch_offset(*(jnp.asarray(x, jnp.float32) for x in (point, mean, axes)))
+    point32, mean32, first, second = (
+        split(jnp.asarray(x, jnp.float32)) for x in (point, mean, axes[0], axes[1])
+    )
+    offset = surface.patch_offset(point32, mean32, (first, second))
     np.testing.assert_allclose(np.linalg.norm(offset), nearest, atol=1e-4)
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry, surface
 from hiosdf_jax.grid.change import Change, Window, recompute
+from hiosdf_jax.grid.vectors import Vector, dot, each, join, length, take
 from hiosdf_jax.state import Grid, Surface
 
 NO_FEATURE = -128
@@ -31,9 +32,6 @@ _SHEET_VOXELS = 2.0
 
 # Where no ray came by, the plane of a patch tells its side up to here, voxels.
 _GUESS_VOXELS = 3.0
-
-# Voxels whose patches are evaluated together.
-_TILE_VOXELS = 1 << 17
 
 # Shifts that one loop iteration of a pass tries in either direction.
 _CHUNK = 8
@@ -173,29 +171,24 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
     order = sorted(range(3), key=lambda k: config.grid_shape[k])
     features = surface.is_feature(config, hits, passes, axes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part, order)
-    nearest = nearest.ravel()
     doubtful = surface.is_doubtful(hits, passes)
     _, squared = nearest_sites(doubtful, mean, config.horizon_voxels, part, order)
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
-    free = is_free(passes, behind)
-    flat_mean, flat_axes = mean.reshape(-1, 3), axes.reshape(-1, 3, 3)
 
-    def place(voxel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Jump to the nearest patch and signed distance to it, of one voxel of the part."""
-        here = jnp.stack(jnp.unravel_index(voxel, inner)) + jnp.stack(within)
-        row = jnp.maximum(nearest[voxel], 0)
-        jump = jnp.stack(jnp.unravel_index(row, shape)) - here
-        patch_axes = flat_axes[row].astype(jnp.float32)
-        offset = surface.patch_offset(jnp.zeros(3, jnp.float32), flat_mean[row] + jump, patch_axes)
-        distance = geometry.safe_norm(offset)
-        side = _side(free, behind, here, offset, distance, patch_axes)
-        found = nearest[voxel] >= 0
-        sdf = jnp.where(found, side * distance * config.voxel_size, config.distance_horizon)
-        return jnp.where(found, jump, NO_FEATURE).astype(jnp.int8), sdf
-
-    # In tiles: the patches of all voxels at once would take many times the map's memory.
-    tile = min(_TILE_VOXELS, nearest.size)
-    jump, sdf = jax.lax.map(place, jnp.arange(nearest.size, dtype=jnp.int32), batch_size=tile)
+    # From the centres of the part's voxels to their nearest patches.
+    nearest = nearest.ravel()
+    found, row = nearest >= 0, jnp.maximum(nearest, 0)
+    here = jnp.unravel_index(jnp.arange(nearest.size, dtype=jnp.int32), inner)
+    here = each(jnp.add, here, within)
+    jump = each(jnp.subtract, jnp.unravel_index(row, shape), here)
+    means, spans = mean.reshape(-1, 3), axes.reshape(-1, 9)
+    long, middle, short = (take(spans, row, first) for first in (0, 3, 6))
+    patch = each(jnp.add, take(means, row), jump)
+    offset = surface.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
+    side = _side(is_free(passes, behind), behind, here, offset, middle, short)
+    metres = side * length(offset) * config.voxel_size
+    sdf = jnp.where(found, metres, config.distance_horizon)
+    jump = jnp.where(found[..., None], join(jump), NO_FEATURE)
 
     def put(old: jax.Array, values: jax.Array) -> jax.Array:
         values = values.reshape(*inner, *old.shape[3:]).astype(old.dtype)
@@ -223,12 +216,12 @@ def is_free(passes: jax.Array, behind: jax.Array) -> jax.Array:
 def _side(
     free: jax.Array,
     behind: jax.Array,
-    here: jax.Array,
-    offset: jax.Array,
-    distance: jax.Array,
-    axes: jax.Array,
+    here: Vector,
+    offset: Vector,
+    middle: Vector,
+    short: Vector,
 ) -> jax.Array:
-    """Sign of a voxel's centre: +1 in free space, -1 behind surfaces.
+    """Sign of voxels' centres: +1 in free space, -1 behind surfaces.
 
     Away from surfaces the rays through the voxel decide. Within a voxel of a flat patch the side
     of its plane does, since rays end in such a voxel: unless the patch is a sheet, with free space
@@ -237,23 +230,25 @@ def _side(
     Args:
         free: (X, Y, Z) bool, what `is_free` says of the window.
         behind: (X, Y, Z) rays that ended a little before the window's voxels.
-        here: (3,) index of the voxel in the window.
-        offset: (3,) from the nearest point of the nearest patch to the centre, voxels.
-        distance: () its length.
-        axes: (3, 3) of that patch.
+        here: (N,) indices of the voxels in the window.
+        offset: (N,) from the nearest point of the nearest patch to the centre, voxels.
+        middle: (N,) the second principal axis of that patch.
+        short: (N,) its third, along the normal.
 
     Returns:
-        () float32.
+        (N,) float32.
     """
-    length = geometry.safe_norm(axes)
-    flat = length[2] < 0.5 * length[1]
-    normal = axes[2] / jnp.maximum(length[2], 1e-6)
-    in_front = jnp.dot(offset, normal, precision="highest") >= 0
-    probe = jnp.round(here - offset - _SHEET_VOXELS * normal).astype(jnp.int32)
-    probe = jnp.clip(probe, 0, jnp.asarray(free.shape) - 1)
-    sheet = free[probe[0], probe[1], probe[2]]
-    by_plane = in_front | sheet
+    shape = free.shape
+    free, behind = free.ravel(), behind.ravel()
+    distance, thickness = length(offset), length(short)
+    flat = thickness < 0.5 * length(middle)
+    normal = each(lambda a: a / jnp.maximum(thickness, 1e-6), short)
+    in_front = dot(offset, normal) >= 0
+    beyond = each(lambda h, o, n: h - o - _SHEET_VOXELS * n, here, offset, normal)
+    probe = each(lambda b, n: jnp.clip(jnp.round(b).astype(jnp.int32), 0, n - 1), beyond, shape)
+    by_plane = in_front | free[geometry.flat_index(shape, probe)]
+    own = geometry.flat_index(shape, here)
     unmet = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
-    by_rays = jnp.where(behind[here[0], here[1], here[2]] > 0, -1.0, unmet)
-    by_rays = jnp.where(free[here[0], here[1], here[2]], 1.0, by_rays)
+    by_rays = jnp.where(behind[own] > 0, -1.0, unmet)
+    by_rays = jnp.where(free[own], 1.0, by_rays)
     return jnp.where(flat & (distance < 1), jnp.where(by_plane, 1.0, -1.0), by_rays)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax.config import Config
+from hiosdf_jax.grid.vectors import Vector, each, split
 
 FRONTIER_STEPS = 127
 """`Surface.frontier` counts steps, so many to the horizon."""
@@ -82,28 +83,29 @@ def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     return (lattice.astype(jnp.float32) + 0.5) * config.voxel_size
 
 
-def flat_index(shape: tuple[int, ...], index: jax.Array) -> jax.Array:
-    """Turns (..., 3) indices of an array of this shape into (...) indices of its raveled form."""
-    return (index[..., 0] * shape[1] + index[..., 1]) * shape[2] + index[..., 2]
+def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:
+    """Turns indices of an array of this shape into those of its raveled form."""
+    return (index[0] * shape[1] + index[1]) * shape[2] + index[2]
 
 
 class Corners(NamedTuple):
     """The eight voxels whose centres surround points, with the weights of trilinear interpolation.
 
     Attributes:
-        index: (..., 8, 3) int32 as into the grid; at the border some lie beyond it.
+        index: (..., 8) int32 each, as into the grid; at the border some lie beyond it.
         flat: (..., 8) int32 into the raveled grid, of the nearest voxel for those beyond it.
         inside: (..., 8) bool.
         weight: (..., 8), adding up to 1.
     """
 
-    index: jax.Array
+    index: Vector
     flat: jax.Array
     inside: jax.Array
     weight: jax.Array
 
 
-_CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
+# Of each axis: whether a corner is the upper one along it.
+_UPPER = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32).T
 
 
 def corners_of(config: Config, points_world: jax.Array) -> Corners:
@@ -114,17 +116,22 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
         points_world: (..., 3) m, finite, inside the bounds.
 
     Returns:
-        The corners.
+        The corners; the first is the lowest along all axes.
     """
-    lattice = points_world / config.voxel_size - 0.5
-    base = jnp.floor(lattice)
-    fraction = (lattice - base)[..., None, :]
-    corner = jnp.asarray(config.corner_index, jnp.int32)
-    index = (base.astype(jnp.int32) - corner)[..., None, :] + _CORNERS
-    weight = jnp.prod(jnp.where(_CORNERS == 1, fraction, 1 - fraction), axis=-1)
-    nearest = jnp.clip(index, 0, jnp.asarray(config.grid_shape) - 1)
-    inside = jnp.all(index == nearest, axis=-1)
-    return Corners(index, flat_index(config.grid_shape, nearest), inside, weight)
+
+    def along(lattice: jax.Array, first: int, upper: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        base = jnp.floor(lattice)
+        fraction = (lattice - base)[..., None]
+        index = (base.astype(jnp.int32) - first)[..., None] + upper
+        return index, jnp.where(upper == 1, fraction, 1 - fraction)
+
+    lattice = split(points_world / config.voxel_size - 0.5)
+    parts = [along(*axis) for axis in zip(lattice, config.corner_index, _UPPER, strict=True)]
+    index = (parts[0][0], parts[1][0], parts[2][0])
+    nearest = each(lambda i, n: jnp.clip(i, 0, n - 1), index, config.grid_shape)
+    x, y, z = each(jnp.equal, index, nearest)
+    weight = parts[0][1] * parts[1][1] * parts[2][1]
+    return Corners(index, flat_index(config.grid_shape, nearest), x & y & z, weight)
 
 
 def clamp(config: Config, points_world: jax.Array) -> jax.Array:

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.gradient import least, value_and_gradient
+from hiosdf_jax.gradient import value_and_gradient
 from hiosdf_jax.grid import geometry, surface
 from hiosdf_jax.grid.distance import NO_FEATURE
+from hiosdf_jax.grid.vectors import Vector, dot, each, join, length, split, take
 from hiosdf_jax.state import Surface
 
 # A voxel is seen or not, even where the distance between the two is 0, m.
@@ -60,26 +61,34 @@ def nearest_patch(config: Config, known: Surface, points_world: jax.Array) -> Ne
     shape = config.grid_shape
     points_world = geometry.clamp(config, points_world)
     corners = geometry.corners_of(config, points_world)
-    jump = known.nearest.reshape(-1, 3)[corners.flat].astype(jnp.int32)
-    found = corners.inside & (jump[..., 0] != NO_FEATURE)
-    site = jnp.where(found[..., None], corners.index + jump, 0)
-    row = geometry.flat_index(shape, site)
-    mean = known.mean.reshape(-1, 3)[row].astype(jnp.float32)
-    axes = known.axes.reshape(-1, 3, 3)[row].astype(jnp.float32)
+    jump = take(known.nearest.reshape(-1, 3), corners.flat)
+    found = corners.inside & (jump[0] != NO_FEATURE)
     # Both from the same voxel's centre, so that large coordinates lose no digits.
-    first = corners.index[..., :1, :]
-    first_world = geometry.voxel_center(config, first)
-    point = (points_world[..., None, :] - first_world) / config.voxel_size
-    offset = surface.patch_offset(point, mean + (site - first), axes)
-    distance = jnp.where(found, geometry.safe_norm(offset), jnp.inf)
+    first = each(lambda i: i[..., 0], corners.index)
+    first_world = geometry.voxel_center(config, join(first))
+    point = split((points_world - first_world) / config.voxel_size)
+    means, axes = known.mean.reshape(-1, 3), known.axes.reshape(-1, 9)
+
+    def offset_from(site: Vector, point: Vector, first: Vector) -> tuple[Vector, jax.Array]:
+        """Vector to points from the patches of voxels, and which voxels these are."""
+        row = geometry.flat_index(shape, site)
+        mean = each(lambda m, s, f: m + (s - f), take(means, row), site, first)
+        spans = (take(axes, row), take(axes, row, 3))
+        return surface.patch_offset(point, mean, spans), row
+
+    # The nearest of eight first, then the distance to that one alone: only it has a derivative.
+    sites = each(lambda i, j: jnp.where(found, i + j, 0), corners.index, jump)
+    offset, _ = offset_from(sites, *(each(lambda a: a[..., None], v) for v in (point, first)))
+    squared = jnp.where(found, dot(offset, offset), jnp.inf)
+    closest = jnp.argmin(squared, axis=-1)[..., None]
+    site = each(lambda s: jnp.take_along_axis(s, closest, axis=-1)[..., 0], sites)
+    offset, row = offset_from(site, point, first)
     any_found = jnp.any(found, axis=-1)
-    metres = jnp.where(any_found, least(distance), 0) * config.voxel_size
+    metres = jnp.where(any_found, length(offset), 0) * config.voxel_size
     # Voxels without a feature have no side: those that `grow` adds must not change old answers.
     signed = known.sdf.ravel()[corners.flat].astype(jnp.float32)
     side = jnp.sum(jnp.where(found, signed * corners.weight, 0), axis=-1)
-    closest = jnp.argmin(distance, axis=-1)[..., None, None]
-    normal = jnp.take_along_axis(axes[..., 2, :], closest, axis=-2)[..., 0, :]
-    spread = jnp.where(any_found, geometry.safe_norm(normal) * config.voxel_size, 0)
+    spread = jnp.where(any_found, length(take(axes, row, 6)) * config.voxel_size, 0)
     return Nearest(
         jnp.where(any_found, jnp.where(side < 0, -metres, metres), config.distance_horizon),
         jax.lax.stop_gradient(spread),
@@ -150,7 +159,7 @@ def frontier(config: Config, known: Surface, points_world: jax.Array) -> jax.Arr
     around = steps[corners.flat].astype(jnp.float32) * geometry.frontier_step_m(config)
     around = jnp.where(corners.inside, around, -config.frontier_horizon)
     index, _, inside = geometry.voxel_of(config, points_world)
-    seen = inside & (steps[geometry.flat_index(config.grid_shape, index)] > 0)
+    seen = inside & (steps[geometry.flat_index(config.grid_shape, split(index))] > 0)
     # Beyond the bounds, and after `grow` until the next update, voxels know nothing. Next to a seen
     # voxel the unseen space begins half a voxel before the unseen one's centre; elsewhere they are
     # taken to be as deep in it as the deepest that knows.

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry
 from hiosdf_jax.grid.beams import Beams
+from hiosdf_jax.grid.vectors import split
 from hiosdf_jax.state import Grid
 
 # Passes stop this far (voxels) before the end of the ray. Measured on a depth stream: 0.78 cm with
@@ -53,7 +54,7 @@ def trace_rays(config: Config, window: Grid, start: jax.Array, beams: Beams) -> 
         along = (steps * size)[..., None] * beams.directions_world[:, None, :]
         points = beams.sensor_world + along
         index, _, inside = geometry.voxel_of_window(config, start, shape, points)
-        voxel = jnp.where(counted & inside, geometry.flat_index(shape, index), voxels)
+        voxel = jnp.where(counted & inside, geometry.flat_index(shape, split(index)), voxels)
         return array.at[voxel.ravel()].add(1, mode="drop")
 
     free = jnp.where(beams.in_range, ranges / size - jnp.where(ends, _MARGIN_VOXELS, 0), -1)

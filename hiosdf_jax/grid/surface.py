@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry
+from hiosdf_jax.grid.vectors import Vector, dot, each, split
 from hiosdf_jax.state import Grid
 
 # The half extent of a patch along a principal axis, in standard deviations: sqrt(3) for hits that
@@ -57,7 +58,7 @@ def fuse_hits(
     shape = window.hits.shape
     voxels = shape[0] * shape[1] * shape[2]
     index, offset, inside = geometry.voxel_of_window(config, start, shape, points_world)
-    voxel = jnp.where(valid & inside, geometry.flat_index(shape, index), voxels)
+    voxel = jnp.where(valid & inside, geometry.flat_index(shape, split(index)), voxels)
 
     # Rows of one voxel become neighbours, so that sums cost the cloud's size, not the grid's.
     order = jnp.argsort(voxel)
@@ -151,26 +152,26 @@ def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
     return (hits > 0) & (hits >= _DOUBT_RATIO * (hits + passes))
 
 
-def patch_offset(point: jax.Array, mean: jax.Array, axes: jax.Array) -> jax.Array:
+def patch_offset(point: Vector, mean: Vector, axes: tuple[Vector, Vector]) -> Vector:
     """Vector from the nearest point of a patch to a point.
 
     A patch is the rectangle around `mean` that the two longest principal axes span; rods and
     single hits are the cases in which one or both of them are short.
 
     Args:
-        point: (..., 3), voxels.
-        mean: (..., 3) centre of the patch, same frame and unit.
-        axes: (..., 3, 3) principal axes as in `Surface.axes`, voxels.
+        point: Voxels.
+        mean: Centre of the patch, same frame and unit.
+        axes: The first two principal axes as in `Surface.axes`, voxels.
 
     Returns:
-        (..., 3) voxels; its length is the distance.
+        Voxels; its length is the distance.
     """
-    offset = point - mean
-    for k in range(2):
-        half = _EXTENT_DEVIATIONS * axes[..., k, :]
-        square = jnp.maximum(jnp.sum(half * half, axis=-1), 1e-12)
-        along = jnp.clip(jnp.sum(offset * half, axis=-1) / square, -1, 1)
-        offset = offset - along[..., None] * half
+    offset = each(jnp.subtract, point, mean)
+    for axis in axes:
+        half = each(lambda a: _EXTENT_DEVIATIONS * a, axis)
+        square = jnp.maximum(dot(half, half), 1e-12)
+        along = jnp.clip(dot(offset, half) / square, -1, 1)
+        offset = each(lambda o, h, along=along: o - along * h, offset, half)
     return offset
 
 
