@@ -13,8 +13,8 @@ Bounds = tuple[Point, Point]
 # Bounds given as multiples of the voxel size must not gain a voxel from rounding (0.3 / 0.1 < 3).
 _LATTICE_TOLERANCE_VOXELS = 1e-4
 
-# The nine numbers of the voxels' principal axes are counted by 32 bits; such a map has 19 GB.
-_MOST_VOXELS = 2**32 // 9
+# The nine numbers of each voxel's principal axes are counted by an int32; such a map has 9.5 GB.
+_MOST_VOXELS = (2**31 - 1) // 9
 
 
 @dataclasses.dataclass(frozen=True)

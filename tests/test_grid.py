@@ -22,6 +22,7 @@ from hiosdf_jax.grid import (
     rays,
     sampling,
     surface,
+    vectors,
 )
 from hiosdf_jax.grid.beams import Beams, place_cloud
 from hiosdf_jax.grid.vectors import join, split
@@ -205,6 +206,24 @@ def test_principal_axes_against_numpy(seed, rank):
     np.testing.assert_allclose(direction @ direction.T, np.eye(3), atol=1e-5)
     rebuilt = direction.T @ np.diag(np.square(deviation)) @ direction
     np.testing.assert_allclose(rebuilt, spread, atol=5e-6 * scale**2)
+
+
+def test_vectors_of_three_arrays():
+    rng = np.random.default_rng(0)
+    table, rows = rng.normal(size=(40, 9)).astype(np.float16), rng.integers(40, size=(5, 2))
+    taken = vectors.take(jnp.asarray(table), jnp.asarray(rows, jnp.int32), 3)
+    np.testing.assert_array_equal(join(taken), table[rows, 3:6].astype(np.float32))
+    jumps = vectors.take(jnp.asarray([[-128, 0, 127]], jnp.int8), jnp.zeros(2, jnp.int32))
+    np.testing.assert_array_equal(join(jumps), [[-128, 0, 127]] * 2)
+    a, b = (rng.normal(size=(6, 3)).astype(np.float32) for _ in range(2))
+    np.testing.assert_allclose(vectors.dot(split(a), split(b)), np.sum(a * b, axis=1), rtol=1e-5)
+    a[0] = 0
+    sizes, pull = jax.vjp(lambda v: vectors.length(split(v)), jnp.asarray(a))
+    exact = np.linalg.norm(a, axis=1)
+    np.testing.assert_allclose(sizes, exact, rtol=1e-6)
+    np.testing.assert_allclose(
+        pull(jnp.ones(6))[0], a / np.where(exact > 0, exact, 1)[:, None], rtol=1e-5
+    )
 
 
 @settings(deadline=None, max_examples=20)

@@ -84,7 +84,7 @@ def voxel_center(config: Config, index: jax.Array) -> jax.Array:
 
 
 def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:
-    """Turns indices of an array of this shape into those of its raveled form."""
+    """Turns indices of an array of this shape, (...) each, into those of the raveled one, (...)."""
     return (index[0] * shape[1] + index[1]) * shape[2] + index[2]
 
 

@@ -35,7 +35,7 @@ def take(table: jax.Array, rows: jax.Array, first: int = 0) -> Vector:
     """Gathers vectors from the rows of a table (N, M), from its column `first` on.
 
     Args:
-        table: Stored numbers; float16 becomes float32, int8 int32.
+        table: Stored numbers, fewer than 2^31; floats become float32, integers int32.
         rows: (...) which of its rows.
         first: The column of the first component.
 
@@ -44,7 +44,8 @@ def take(table: jax.Array, rows: jax.Array, first: int = 0) -> Vector:
     """
     floats = jnp.issubdtype(table.dtype, jnp.floating)
     dtype = jnp.float32 if floats else jnp.int32
-    # One index a number: a pair of them takes several times as long on a CPU.
+    # One index a number: a pair of them takes several times as long on a CPU. Unsigned, so that
+    # none is looked at for being negative.
     flat, start = table.ravel(), rows.astype(jnp.uint32) * table.shape[1] + first
     x, y, z = (flat[start + k].astype(dtype) for k in range(3))
     return x, y, z
