@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
-from hiosdf_jax.grid.geometry import safe_norm
+from hiosdf_jax.grid.vectors import length, split
 from hiosdf_jax.samples import Samples, draw_from_mask
 
 # Pairs of query and cloud point that are looked at together: bounds the memory.
@@ -37,7 +37,7 @@ def sample_local(
         are without weight.
     """
     choice_key, depth_key = jax.random.split(key)
-    ranges = safe_norm(points_world - sensor_world)
+    ranges = length(split(points_world - sensor_world))
     eligible = valid & (ranges < config.local_max_range)
     chosen, possible = draw_from_mask(eligible, config.local_points, choice_key)
     ends, end_ranges = points_world[chosen], ranges[chosen]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry
+from hiosdf_jax.grid.vectors import length, split
 
 
 class Beams(NamedTuple):
@@ -49,7 +50,7 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
     sensor_world = pose[:3, 3]
     offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
     # Not the cloud's own: a pose that is rigid but for rounding must not take rays out of reach.
-    ranges = geometry.safe_norm(offsets_world)
+    ranges = length(split(offsets_world))
     in_range = finite & (ranges >= config.min_range)
     points_world = sensor_world + offsets_world
     _, _, inside = geometry.voxel_of(config, points_world)

@@ -190,10 +190,3 @@ def write_window(array: jax.Array, start: tuple[jax.Array, ...], values: jax.Arr
 def _full_start(start: tuple[jax.Array, ...], rest: tuple[int, ...]) -> tuple[jax.Array, ...]:
     # Of one type: a plain 0 would be an int64 where the user has enabled those.
     return (*start, *(jnp.zeros((), jnp.int32) for _ in rest))
-
-
-def safe_norm(vectors: jax.Array) -> jax.Array:
-    """Length of (..., 3) vectors, with gradient 0 instead of NaN at 0."""
-    square = jnp.sum(vectors * vectors, axis=-1)
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)

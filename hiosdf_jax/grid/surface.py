@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid import geometry
-from hiosdf_jax.grid.vectors import Vector, dot, each, split
+from hiosdf_jax.grid.vectors import Vector, dot, each, length, split
 from hiosdf_jax.state import Grid
 
 # The half extent of a patch along a principal axis, in standard deviations: sqrt(3) for hits that
@@ -68,7 +68,7 @@ def fuse_hits(
     target = jnp.full(count, voxels, voxel.dtype).at[group].set(voxel)
     used = (voxel < voxels).astype(jnp.float32)
 
-    ranges = geometry.safe_norm(points_world[order] - sensor_world)
+    ranges = length(split(points_world[order] - sensor_world))
     noise_floor, noise_growth = config.range_noise
     weight = used / (1 + noise_growth / noise_floor * ranges**2) ** 2
     offset = jnp.where(used[:, None] > 0, offset, 0)

@@ -1,7 +1,7 @@
 """Vectors as three arrays, one a component.
 
 Where each of many points has vectors of its own, a last axis of three keeps XLA from using a CPU's
-vector instructions: to find the nearest patches of 102,400 points takes four times as long with it.
+vector instructions: the nearest patches of 102,400 points take three times as long with it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def take(table: jax.Array, rows: jax.Array, first: int = 0) -> Vector:
     """
     floats = jnp.issubdtype(table.dtype, jnp.floating)
     dtype = jnp.float32 if floats else jnp.int32
-    # One index a number: a pair of them takes several times as long on a CPU. Unsigned, so that
+    # One index a number: a pair of them takes twice as long on a CPU. Unsigned, so that
     # none is looked at for being negative.
     flat, start = table.ravel(), rows.astype(jnp.uint32) * table.shape[1] + first
     x, y, z = (flat[start + k].astype(dtype) for k in range(3))
