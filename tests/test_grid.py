@@ -429,6 +429,18 @@ def test_the_horizon_cuts_off():
     assert (np.asarray(none) == -1).all()
 
 
+@pytest.mark.parametrize(("share", "horizon"), [(0.0, 9), (0.0005, 9), (0.002, 25), (0.02, 40)])
+def test_all_steps_as_on_a_gpu_find_what_the_needed_ones_find(monkeypatch, share, horizon):
+    rng = np.random.default_rng(11)
+    sites = jnp.asarray(rng.random((40, 21, 13)) < share)
+    offset = jnp.asarray(rng.uniform(-0.5, 0.5, (*sites.shape, 3)), jnp.float32)
+    part = distance.Part((3, 2, 0), (30, 11, 13))
+    needed = distance.nearest_sites(sites, offset, horizon, part)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for a, b in zip(distance.nearest_sites(sites, offset, horizon, part), needed, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_nearest_sites_with_offsets_against_a_tree():
     """Off the lattice a pass can prefer a site whose other coordinates are worse: bounded."""
     rng = np.random.default_rng(10)

@@ -51,6 +51,7 @@ def some_samples(count=64, seed=0):
 
 
 def train(config, network, samples, epochs, average=0.0, seed=0):
+    config = dataclasses.replace(config, epochs=min(config.epochs, epochs))
     return training.train(
         config, network, samples, jnp.int32(epochs), jnp.float32(average), jax.random.key(seed)
     )
@@ -156,6 +157,20 @@ def test_epochs_and_batches_are_honoured():
     original = {tuple(row): s for row, s in zip(*map(np.asarray, samples[:2]), strict=True)}
     flat = np.asarray(parts.sdf).ravel()
     assert all(original[tuple(row)] == s for row, s in zip(rows, flat, strict=True))
+
+
+@pytest.mark.parametrize(("epochs", "warmup_epochs"), [(5, 5), (2, 5), (5, 2), (2, 1), (1, 50)])
+def test_which_epochs_are_known_before_changes_nothing(epochs, warmup_epochs):
+    config = dataclasses.replace(TINY, epochs=epochs, warmup_epochs=warmup_epochs)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(70)
+    trained, parts, _ = train(config, network, samples, 5)
+    expected, expected_parts, _ = train(
+        dataclasses.replace(TINY, epochs=5, warmup_epochs=5), network, samples, 5
+    )
+    assert int(trained.optimizer[0].count) == 5
+    np.testing.assert_allclose(parts, expected_parts, rtol=1e-6)
+    for a, b in zip(jax.tree.leaves(trained), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
 
 
 @pytest.mark.parametrize("every", [1, 3])

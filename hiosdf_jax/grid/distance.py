@@ -128,7 +128,10 @@ def _pass(
 
     best = jax.lax.dynamic_slice_in_dim(squared, first, length, axis)
     start = (jnp.int32(0), best, jnp.zeros(best.shape, jnp.int32))
-    _, best, shift = jax.lax.while_loop(more, step, start)
+    if jax.default_backend() == "cpu":
+        _, best, shift = jax.lax.while_loop(more, step, start)
+    else:  # To ask for more takes a GPU longer than to do it all, since it waits for the host.
+        _, best, shift = jax.lax.fori_loop(0, chunks, lambda _, carry: step(carry), start)
     return best, shift
 
 

@@ -75,7 +75,8 @@ def train(
         config: The map's configuration.
         network: The network so far.
         samples: What to fit.
-        epochs: () int32 times to go through the samples.
+        epochs: () int32 times to go through the samples; not fewer than the configuration's least,
+            `epochs` or `warmup_epochs`.
         average: () share of the old weights in those that are served.
         key: Source of randomness, for the order of the samples.
 
@@ -113,7 +114,11 @@ def train(
         return params, state, jax.tree.map(jnp.mean, parts)
 
     start = (network.params, network.optimizer, Losses(jnp.float32(0), jnp.float32(0)))
-    params, state, parts = jax.lax.fori_loop(0, epochs, epoch, start)
+    # On a GPU each turn of a loop waits for the host unless its length is known before, and
+    # `update` returns only after the last such turn: only a warm-up's are of that kind.
+    least = min(config.epochs, config.warmup_epochs)
+    warm = jax.lax.fori_loop(least, epochs, epoch, start)
+    params, state, parts = jax.lax.fori_loop(0, least, epoch, warm)
 
     finite = jnp.isfinite(parts.sdf + parts.eikonal) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(params)])
