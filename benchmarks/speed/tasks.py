@@ -427,7 +427,8 @@ def endurance_rows(bench: Bench) -> list[Row]:
     bench.baselines["endurance"] = [Baseline("their first 10 %", start)]
     flags = hio.Flag(int(state.report.flags))
     cut = f"stopped by --minutes, of {count:,}; " if made < count else ""
-    note = f"{cut}flags: {flags.name or 'none'}"
+    medians = [f"{np.median(part):.2f}" for part in np.array_split(times_ms, min(10, made))]
+    note = f"{cut}flags: {flags.name or 'none'}; medians of its tenths: {', '.join(medians)}"
     rows = [
         Row(f"{made:,} updates in a row, light, all", "ms", spread_of(times_ms), note=note),
         Row(f"{made:,} updates in a row, light, last 10 %", "ms", end, "endurance"),
