@@ -181,9 +181,9 @@ def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.A
         sampling.sample_grid(config, grid, grid_key),
         sample_local(config, beams.points_world, beams.ends, sensor_world, local_key),
     )
-    epochs, average = schedule(config, state.updates)
+    extra_epochs, average = schedule(config, state.updates)
     network, parts, trained = training.train(
-        config, state.network, samples, epochs, average, order_key
+        config, state.network, samples, extra_epochs, average, order_key
     )
 
     outside = beams.ends & ~beams.inside
@@ -222,12 +222,13 @@ def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
         updates: () int32, that the map has had.
 
     Returns:
-        epochs: () int32.
+        extra_epochs: () int32, beyond those that every update makes.
         average: () share of the old weights in those that are served; a running mean over the
             first updates, so that the untrained network is never served.
     """
     epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
-    return epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
+    extra_epochs = epochs - training.least_epochs(config)
+    return extra_epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
 
 
 def _typed_key(key: Any) -> jax.Array:

@@ -41,6 +41,15 @@ TINY = dataclasses.replace(
 )
 
 
+# Stands for the command that maps a whole stream, which takes too long for a test.
+CHECKS_ITS_ARGUMENTS = """
+import sys, pathlib
+command, stream, option, output = sys.argv[1:]
+assert (command, option) == ("map", "--output")
+assert pathlib.Path(stream).is_file() and pathlib.Path(output).is_dir()
+"""
+
+
 @pytest.fixture
 def stream(tmp_path):
     """Three frames of a sensor in a room, as a file."""
@@ -71,6 +80,7 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "plan", plan)
     monkeypatch.setattr(tasks.datasets, "find_bounds", lambda _: extent)
     monkeypatch.setattr(tasks.subprocess, "check_output", import_time)
+    monkeypatch.setattr(tasks, "_HIOSDF", CHECKS_ITS_ARGUMENTS)
     monkeypatch.setattr(tasks, "stages", types.SimpleNamespace(take_apart=take_apart))
     output = tmp_path / "out" / "speed.json"
     assert command.main(["--quick", "--stream", str(stream), "--output", str(output)]) == 0
@@ -87,7 +97,9 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         assert spread[0] > 0 or name.startswith("compilation"), row
         assert not row["limit"] or row["share"] > 0, row
     assert found["compilations during these"]["spread"]["median"] == 0
-    assert found["6 updates in a row, light, all"]["note"].startswith("flags: none; medians of its tenths: ")
+    assert found["resident memory, peak of hiosdf map"]["spread"]["median"] > 5
+    note = found["6 updates in a row, light, all"]["note"]
+    assert note.startswith("flags: none; medians of its tenths: ") and note.count(",") == 5
     for name in ("training", "distance", "local samples"):
         assert found[f"{name}, light"]["limit"]
     for key in {row["compare"] for row in record["rows"]} - {""}:
@@ -116,7 +128,15 @@ def assert_stages_make_the_update(parts, state, whole):
             assert max(np.abs(np.asarray(a, float) - np.asarray(b)).max() for a, b in pairs) > 0.01
 
 
-def test_sizes_of_clouds_and_maps(monkeypatch):
+def test_a_run_that_fails_has_no_peak(monkeypatch, tmp_path):
+    extent = datasets.Extent(BOUNDS, CONFIG.max_range)
+    bench = tasks.Bench(TINY, tmp_path, [], extent, deadline=math.inf)
+    monkeypatch.setattr(tasks, "_HIOSDF", "raise SystemExit(3)")
+    with pytest.raises(RuntimeError, match="exit code 3"):
+        tasks.whole_run_rows(bench)
+
+
+def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
     """With an update that does nothing: what it is given is what the rows are about."""
     given = []
 
@@ -126,7 +146,7 @@ def test_sizes_of_clouds_and_maps(monkeypatch):
 
     monkeypatch.setattr(tasks.hio, "update", update)
     extent = datasets.Extent(BOUNDS, CONFIG.max_range)
-    bench = tasks.Bench(TINY, [room_cloud(0)], extent, deadline=math.inf)
+    bench = tasks.Bench(TINY, tmp_path, [room_cloud(0)], extent, deadline=math.inf)
     found = tasks.cloud_size_rows(bench)
     assert [row.name for row in found] == [
         "update, light, 200 points, 300 used",
@@ -212,7 +232,7 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     from benchmarks.speed import torch_siren
 
     config = hio.Config.paper(BOUNDS, near_samples=60, far_samples=30, local_points=1)
-    config = dataclasses.replace(config, local_ray_samples=10, weight_average=0.0)
+    config = dataclasses.replace(config, local_ray_samples=10, weight_average=0.0, epochs=5)
     network = training.init_network(config, jax.random.key(0))
     points = jax.random.uniform(jax.random.key(1), (100, 3), minval=-1)
     weight = (jnp.arange(100) % 4 > 0).astype(jnp.float32)
@@ -233,7 +253,7 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     steps = torch_siren.optimizer(model, config.learning_rate, config.weight_decay)
     torch_siren.train(model, steps, 5, tensors, weights)
     trained, _, _ = training.train(
-        config, network, samples, jnp.int32(5), jnp.float32(0), jax.random.key(2)
+        config, network, samples, jnp.int32(0), jnp.float32(0), jax.random.key(2)
     )
     after = training.losses(config, trained.params, points, samples)
     ours_after = weights[0] * after.sdf + weights[1] * after.eikonal

@@ -429,7 +429,7 @@ def test_the_horizon_cuts_off():
     assert (np.asarray(none) == -1).all()
 
 
-@pytest.mark.parametrize(("share", "horizon"), [(0.0, 9), (0.0005, 9), (0.002, 25), (0.02, 40)])
+@pytest.mark.parametrize(("share", "horizon"), [(0.0005, 9), (0.0005, 16), (0.002, 25), (0.02, 40)])
 def test_all_steps_as_on_a_gpu_find_what_the_needed_ones_find(monkeypatch, share, horizon):
     rng = np.random.default_rng(11)
     sites = jnp.asarray(rng.random((40, 21, 13)) < share)

@@ -468,6 +468,8 @@ def test_the_schedule_warms_up_and_never_serves_the_untrained_network():
     config = dataclasses.replace(CONFIG, warmup_updates=3, warmup_epochs=7, epochs=2)
     config = dataclasses.replace(config, weight_average=0.8)
     made = [mapping.schedule(config, jnp.int32(n)) for n in range(7)]
-    assert [int(epochs) for epochs, _ in made] == [7, 7, 7, 2, 2, 2, 2]
+    assert [int(extra) for extra, _ in made] == [5, 5, 5, 0, 0, 0, 0]
+    short = dataclasses.replace(config, warmup_epochs=1)
+    assert [int(mapping.schedule(short, jnp.int32(n))[0]) for n in (2, 3)] == [0, 1]
     expected = [0, 1 / 2, 2 / 3, 3 / 4, 4 / 5, 0.8, 0.8]
     np.testing.assert_allclose([float(average) for _, average in made], expected, atol=1e-6)

@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from benchmarks.speed.rows import Row, format_table
 from benchmarks.speed.tasks import FULL, OUT_OF_TIME, QUICK, Bench, Task, open_bench, plan
-from hiosdf_jax import datasets
 from hiosdf_jax.run import to_json
 
 
@@ -37,8 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sizes = QUICK if options.quick else FULL
     if options.endurance is not None:
         sizes = dataclasses.replace(sizes, endurance=options.endurance)
-    stream = datasets.NpzStream(options.stream)
-    bench = open_bench(stream, sizes, began + 60 * options.minutes)
+    bench = open_bench(options.stream, sizes, began + 60 * options.minutes)
     rows: list[Row] = []
     with tqdm(list(plan(bench)), unit="task") as progress:
         for name, task in progress:

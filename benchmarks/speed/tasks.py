@@ -8,6 +8,7 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -34,6 +35,8 @@ Frame = tuple[np.ndarray, np.ndarray]  # cloud (N, 3) m in the sensor's frame, T
 Task = Callable[[], list[Row]]
 
 OUT_OF_TIME = "not run: --minutes are over"
+
+_HIOSDF = "import sys; from hiosdf_jax.cli import main; sys.exit(main(sys.argv[1:]))"
 
 # {label: preset and what is changed of it}, the least memory first: of peaks only the first is a
 # configuration's own for sure.
@@ -64,6 +67,7 @@ class Sizes:
         cloud_sizes: Points a cloud.
         map_edges: Of square maps as high as the stream's bounds, m.
         endurance: Updates in a row.
+        whole_run: Whether to run `hiosdf map` over the whole stream.
     """
 
     configs: tuple[str, ...]
@@ -80,6 +84,7 @@ class Sizes:
     cloud_sizes: tuple[int, ...]
     map_edges: tuple[float, ...]
     endurance: int
+    whole_run: bool
 
 
 FULL = Sizes(
@@ -97,6 +102,7 @@ FULL = Sizes(
     cloud_sizes=(1_000, 16_000, 77_000, 300_000),
     map_edges=(10.0, 20.0, 60.0),
     endurance=10_000,
+    whole_run=False,  # needs more packages than a GPU machine may have
 )
 
 QUICK = Sizes(
@@ -114,6 +120,7 @@ QUICK = Sizes(
     cloud_sizes=(16_000, 77_000),
     map_edges=(10.0, 20.0),
     endurance=100,
+    whole_run=True,
 )
 
 
@@ -123,6 +130,7 @@ class Bench:
 
     Attributes:
         sizes: How much to measure.
+        path: Of the stream.
         frames: Of the stream, read beforehand.
         extent: Its bounds and range.
         deadline: When to stop, on the clock of `time.perf_counter`.
@@ -132,6 +140,7 @@ class Bench:
     """
 
     sizes: Sizes
+    path: Path
     frames: list[Frame]
     extent: datasets.Extent
     deadline: float
@@ -155,18 +164,21 @@ class Bench:
         return time.perf_counter() > self.deadline
 
 
-def open_bench(stream: datasets.Stream, sizes: Sizes, deadline: float) -> Bench:
-    """Reads a stream, so that no reading is timed."""
+def open_bench(path: Path, sizes: Sizes, deadline: float) -> Bench:
+    """Reads a stream, an .npz file, so that no reading is timed."""
+    stream = datasets.NpzStream(path)
     count = min(len(stream), 200)
     frames = [stream[k] for k in tqdm(range(count), desc="reading", unit="frame")]
     kept = datasets.FrameStream("frames", count, frames.__getitem__)
-    return Bench(sizes, frames, datasets.find_bounds(kept), deadline)
+    return Bench(sizes, path, frames, datasets.find_bounds(kept), deadline)
 
 
 def plan(bench: Bench) -> Iterator[tuple[str, Task]]:
     """All tasks in their order: their names and what runs them."""
     configs = bench.sizes.configs
     apart = configs[-1]
+    if bench.sizes.whole_run:
+        yield "hiosdf map", lambda: whole_run_rows(bench)
     yield "imports", lambda: import_rows(bench)
     for label in configs:
         yield f"update, {label}", functools.partial(update_rows, bench, label)
@@ -180,6 +192,25 @@ def plan(bench: Bench) -> Iterator[tuple[str, Task]]:
     yield "cloud sizes", lambda: cloud_size_rows(bench)
     yield "map sizes", lambda: map_size_rows(bench)
     yield "endurance", lambda: endurance_rows(bench)
+
+
+def whole_run_rows(bench: Bench) -> list[Row]:
+    """Time and peak memory of `hiosdf map` over the stream, in a process of its own.
+
+    The first of the tasks: a process counts as its own peak what the one that starts it holds.
+    """
+    with tempfile.TemporaryDirectory() as output:
+        command = [sys.executable, "-c", _HIOSDF, "map", str(bench.path), "--output", output]
+        start = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        took_s = time.perf_counter() - start
+    if status != 0:
+        raise RuntimeError(f"hiosdf map ended with exit code {os.waitstatus_to_exitcode(status)}")
+    return [
+        Row("hiosdf map, the whole stream, light", "s", single(took_s)),
+        Row("resident memory, peak of hiosdf map", "MB", single(_resident_mb(usage))),
+    ]
 
 
 def import_rows(bench: Bench) -> list[Row]:
@@ -210,9 +241,7 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
     prepared = jax.device_put(intake.prepare(cloud, pose, config.max_points))
     alone = time_ms(mapping._update_jit, state, *prepared, seconds=bench.sizes.seconds)
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
-    # ru_maxrss is in KiB on Linux and in bytes on macOS.
-    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    resident *= 1 if sys.platform == "darwin" else 1024
+    resident_mb = _resident_mb(resource.getrusage(resource.RUSAGE_SELF))
     rows = [
         Row(f"update, {label}", "ms", spread_of(times_ms), "training"),
         Row(f"update, {label}, on the device alone", "ms", alone, "training"),
@@ -223,7 +252,7 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
             note="the first update less the second, tracing included",
         ),
         Row(f"arrays of the map, {label}", "MB", single(1e-6 * arrays)),
-        Row(f"resident memory, peak so far, {label}", "MB", single(1e-6 * resident)),
+        Row(f"resident memory, peak so far, {label}", "MB", single(resident_mb)),
     ]
     stats = _device_memory()
     if "peak_bytes_in_use" not in stats:
@@ -474,7 +503,8 @@ def _training_arguments(config: hio.Config) -> tuple[Any, ...]:
     points = _points_in(config, count)
     radius = jnp.linalg.norm(points - network.origin_world, axis=-1)
     samples = Samples(points, radius - 1, jnp.ones(count))
-    return network, samples, jnp.int32(config.epochs), jnp.float32(0.9), jax.random.key(1)
+    extra_epochs = jnp.int32(config.epochs - training.least_epochs(config))
+    return network, samples, extra_epochs, jnp.float32(0.9), jax.random.key(1)
 
 
 def _take_apart(bench: Bench, label: str) -> dict[str, stages.Stage]:
@@ -507,6 +537,11 @@ def _points_in(config: hio.Config, count: int) -> jax.Array:
     """(count, 3) m, uniform in the bounds."""
     low, high = jnp.asarray(config.bounds, jnp.float32)
     return low + jax.random.uniform(jax.random.key(0), (count, 3)) * (high - low)
+
+
+def _resident_mb(usage: resource.struct_rusage) -> float:
+    """The peak; it is given in KiB on Linux and in bytes on macOS."""
+    return 1e-6 * usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _device_memory() -> dict[str, int]:

@@ -61,11 +61,16 @@ def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> 
     return _means(_sums(config, params, points, samples), _weights(config, samples))
 
 
+def least_epochs(config: Config) -> int:
+    """Epochs that every update makes, be it one of the warm-up or not."""
+    return min(config.epochs, config.warmup_epochs)
+
+
 def train(
     config: Config,
     network: Network,
     samples: Samples,
-    epochs: jax.Array,
+    extra_epochs: jax.Array,
     average: jax.Array,
     key: jax.Array,
 ) -> tuple[Network, Losses, jax.Array]:
@@ -75,8 +80,7 @@ def train(
         config: The map's configuration.
         network: The network so far.
         samples: What to fit.
-        epochs: () int32 times to go through the samples; not fewer than the configuration's least,
-            `epochs` or `warmup_epochs`.
+        extra_epochs: () int32 times to go through the samples beyond `least_epochs`.
         average: () share of the old weights in those that are served.
         key: Source of randomness, for the order of the samples.
 
@@ -114,11 +118,14 @@ def train(
         return params, state, jax.tree.map(jnp.mean, parts)
 
     start = (network.params, network.optimizer, Losses(jnp.float32(0), jnp.float32(0)))
-    # On a GPU each turn of a loop waits for the host unless its length is known before, and
-    # `update` returns only after the last such turn: only a warm-up's are of that kind.
-    least = min(config.epochs, config.warmup_epochs)
-    warm = jax.lax.fori_loop(least, epochs, epoch, start)
-    params, state, parts = jax.lax.fori_loop(0, least, epoch, warm)
+    least = least_epochs(config)
+    if jax.default_backend() == "cpu":
+        params, state, parts = jax.lax.fori_loop(0, least + extra_epochs, epoch, start)
+    else:
+        # A GPU waits for the host at each turn of a loop whose length is not known before, and
+        # `update` returns only after the last such turn.
+        extra = jax.lax.fori_loop(0, extra_epochs, epoch, start)
+        params, state, parts = jax.lax.fori_loop(0, least, epoch, extra)
 
     finite = jnp.isfinite(parts.sdf + parts.eikonal) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(params)])
