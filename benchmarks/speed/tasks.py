@@ -202,7 +202,12 @@ def whole_run_rows(bench: Bench) -> list[Row]:
     with tempfile.TemporaryDirectory() as output:
         command = [sys.executable, "-c", _HIOSDF, "map", str(bench.path), "--output", output]
         start = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            command,
+            env=_environment(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         _, status, usage = os.wait4(process.pid, 0)
         took_s = time.perf_counter() - start
     if status != 0:
@@ -215,9 +220,7 @@ def whole_run_rows(bench: Bench) -> list[Row]:
 
 def import_rows(bench: Bench) -> list[Row]:
     """Time to import the package, in processes of their own, beside what it stands on."""
-    root = Path(hio.__file__).parents[1]
-    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    environment = _environment()
 
     def seconds(names: str) -> float:
         code = f"import time; t = time.perf_counter(); import {names}; print(time.perf_counter()-t)"
@@ -537,6 +540,13 @@ def _points_in(config: hio.Config, count: int) -> jax.Array:
     """(count, 3) m, uniform in the bounds."""
     low, high = jnp.asarray(config.bounds, jnp.float32)
     return low + jax.random.uniform(jax.random.key(0), (count, 3)) * (high - low)
+
+
+def _environment() -> dict[str, str]:
+    """For processes that are to import the package that this one has imported."""
+    root = Path(hio.__file__).parents[1]
+    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _resident_mb(usage: resource.struct_rusage) -> float:
