@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import hiosdf_jax as hio
@@ -160,16 +161,62 @@ def test_epochs_and_batches_are_honoured():
     assert all(original[tuple(row)] == s for row, s in zip(rows, flat, strict=True))
 
 
+def test_the_depths_of_a_ray_s_samples_are_in_all_groups():
+    config = hio.Config.paper(BOUNDS, eikonal_every=4)
+    count = config.near_samples + config.far_samples
+    total = count + config.local_points * config.local_ray_samples
+    group = np.argsort(training._order(config, total, jax.random.key(0))) % 4
+    kinds = [group[: config.near_samples], group[config.near_samples : count]]
+    kinds += list(group[count:].reshape(-1, config.local_ray_samples).T)
+    for kind in kinds:  # five standard deviations
+        deviation = np.sqrt(len(kind) * 3 / 16)
+        assert np.abs(np.bincount(kind, minlength=4) - len(kind) / 4).max() < 5 * deviation
+
+
+@pytest.mark.parametrize("tile", [1024, 16])
+@pytest.mark.parametrize("every", [1, 2, 4])
+def test_each_slope_counts_once_in_as_many_epochs(monkeypatch, every, tile):
+    monkeypatch.setattr(tiles, "_ROWS", tile)
+    config = dataclasses.replace(TINY, eikonal_every=every, eikonal_weight=0.3, learning_rate=0.02)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(64)
+    optimizer = optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
+    params, state = network.params, optimizer.init(network.params)
+    points = samples.points_world - network.origin_world
+    order = training._order(config, 64, jax.random.key(1))
+    place = np.argsort(order) // (64 // tile if tile < 64 else 1)  # dealt to the tiles as cards
+    for epoch in range(2 * every):
+        chosen = place % every == epoch % every
+
+        def objective(params, chosen=chosen):
+            model = siren.siren(config)
+            value = jax.vmap(lambda point: model.apply(params, point))(points)
+            gradient = jax.vmap(jax.grad(lambda point: model.apply(params, point)))(points)
+            error, slope = jnp.abs(value - samples.sdf), jnp.linalg.norm(gradient, axis=-1)
+            sdf = jnp.average(error, weights=samples.weight)
+            eikonal = jnp.average(jnp.abs(slope - 1), weights=samples.weight * chosen)
+            return config.sdf_weight * sdf + config.eikonal_weight * eikonal, (sdf, eikonal)
+
+        gradients, expected = jax.grad(objective, has_aux=True)(params)
+        updates, state = optimizer.update(gradients, state, params)
+        params = optax.apply_updates(params, updates)
+        trained, parts, _ = train(config, network, samples, epoch + 1)
+        np.testing.assert_allclose(parts, expected, rtol=2e-4)
+    for a, b in zip(jax.tree.leaves(trained.params), jax.tree.leaves(params), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-4)
+
+
 @pytest.mark.parametrize("device", ["cpu", "gpu"])
+@pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize(("epochs", "warmup_epochs"), [(5, 5), (2, 5), (5, 2), (2, 1), (1, 50)])
-def test_which_epochs_are_extra_changes_nothing(monkeypatch, device, epochs, warmup_epochs):
-    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples(70)
+def test_which_epochs_are_extra_changes_nothing(monkeypatch, device, every, epochs, warmup_epochs):
+    tiny = dataclasses.replace(TINY, eikonal_every=every)
+    network, samples = training.init_network(tiny, jax.random.key(0)), some_samples(72)
     expected, expected_parts, _ = train(
-        dataclasses.replace(TINY, epochs=5, warmup_epochs=5), network, samples, 5
+        dataclasses.replace(tiny, epochs=5, warmup_epochs=5), network, samples, 5
     )
     monkeypatch.setattr(jax, "default_backend", lambda: device)
     monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float32)
-    config = dataclasses.replace(TINY, epochs=epochs, warmup_epochs=warmup_epochs)
+    config = dataclasses.replace(tiny, epochs=epochs, warmup_epochs=warmup_epochs)
     trained, parts, _ = train(config, network, samples, 5)
     assert int(trained.optimizer[0].count) == 5
     np.testing.assert_allclose(parts, expected_parts, rtol=1e-5)
@@ -203,15 +250,18 @@ def test_a_step_by_tiles_is_a_step(monkeypatch, every):
 @pytest.mark.parametrize("every", [1, 3])
 def test_the_padding_of_a_gpus_tile_changes_nothing(monkeypatch, every):
     config = dataclasses.replace(TINY, eikonal_every=every)
-    network, samples = training.init_network(config, jax.random.key(0)), some_samples(70)
+    network, samples = training.init_network(config, jax.random.key(0)), some_samples(72)
     plain, losses, _ = train(config, network, samples, 2)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float32)
-    assert tiles.tile_index(60_000, 4).shape == (1, 60_416)
+    # Each share divides by 256: the 60,000 samples of the paper, the 42,000 of default.
+    for rows, groups, size in [(60_000, 1, 60_160), (60_000, 2, 60_416), (42_000, 4, 43_008)]:
+        assert tiles.tile_index(rows, groups).shape == (1, size)
+        assert size % (256 * groups) == 0
     assert tiles.tile_index(60_000, 1000).shape == (1, 60_000)  # more padding than it is worth
-    monkeypatch.setattr(tiles, "_MOST_PADDING", 10)
+    monkeypatch.setattr(tiles, "_MOST_PADDING", 20)
     batch = training._split(config, samples, jax.random.key(0))
-    assert batch.sdf.shape == (1, 1, 128 * every)
+    assert batch.sdf.shape == (1, 1, 256 * every)
     padded, padded_losses, _ = train(config, network, samples, 2)
     np.testing.assert_allclose(padded_losses, losses, rtol=1e-5)
     for a, b in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):

@@ -113,8 +113,8 @@ def train(
         updates, state = optimizer.update(gradients, state, params)
         return (optax.apply_updates(params, updates), state), _means(sums, weights)
 
-    def epoch(_: jax.Array, carry: tuple[Any, Any, Losses]) -> tuple[Any, Any, Losses]:
-        (params, state), parts = jax.lax.scan(step, carry[:2], batches)
+    def epoch(number: jax.Array, carry: tuple[Any, Any, Losses]) -> tuple[Any, Any, Losses]:
+        (params, state), parts = jax.lax.scan(step, carry[:2], _turn(config, batches, number))
         return params, state, jax.tree.map(jnp.mean, parts)
 
     start = (network.params, network.optimizer, Losses(jnp.float32(0), jnp.float32(0)))
@@ -125,7 +125,9 @@ def train(
         # A GPU waits for the host at each turn of a loop whose length is not known before, and
         # `update` returns only after the last such turn.
         extra = jax.lax.fori_loop(0, extra_epochs, epoch, start)
-        params, state, parts = jax.lax.fori_loop(0, least, epoch, extra)
+        params, state, parts = jax.lax.fori_loop(
+            0, least, lambda number, carry: epoch(extra_epochs + number, carry), extra
+        )
 
     finite = jnp.isfinite(parts.sdf + parts.eikonal) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(params)])
@@ -142,19 +144,40 @@ def train(
 
 
 def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
-    """Shuffles samples into (batches, tiles, size) parts; what does not fill a batch is left out.
+    """Deals samples to (batches, tiles, size) parts; what does not fill a batch is left out.
 
-    A single batch needs no chance: one sample in `eikonal_every` comes first in its tile.
+    The `eikonal_every` groups of a tile, those whose slopes count in turn, lie one after another.
     """
     count = samples.sdf.shape[0]
     size = count // config.batches
     dealt = tiles.tile_index(size, config.eikonal_every)
-    first = np.argsort(np.arange(dealt.shape[1]) % config.eikonal_every > 0, kind="stable")
-    dealt = dealt[:, first]
-    order = jnp.arange(count) if config.batches == 1 else jax.random.permutation(key, count)
-    order = order[: size * config.batches].reshape(config.batches, size)
+    groups = np.arange(dealt.shape[1]) % config.eikonal_every
+    dealt = dealt[:, np.argsort(groups, kind="stable")]
+    order = _order(config, count, key)[: size * config.batches].reshape(config.batches, size)
     batches = jax.tree.map(lambda array: array[order[:, np.minimum(dealt, size - 1)]], samples)
     return batches._replace(weight=jnp.where(dealt < size, batches.weight, 0))
+
+
+def _order(config: Config, count: int, key: jax.Array) -> jax.Array:
+    """Shuffles what goes to several batches, or groups."""
+    if config.batches > 1:
+        return jax.random.permutation(key, count)
+    if config.eikonal_every > 1:
+        # The samples themselves are drawn anew at every update: the same order will do. It must
+        # only not be their own, in which each n-th sample of a ray is at the same of its depths.
+        return jnp.asarray(np.random.default_rng(0).permutation(count))
+    return jnp.arange(count)
+
+
+def _turn(config: Config, batches: Samples, epoch: jax.Array) -> Samples:
+    """Moves each tile on to its next group in every epoch: the slopes of the first one count.
+
+    Were it the same group in all epochs of an update, the network would fit its slopes alone.
+    """
+    if config.eikonal_every == 1:
+        return batches
+    places = -epoch * _sloped(config, batches)
+    return jax.tree.map(lambda array: jnp.roll(array, places, axis=2), batches)
 
 
 def _sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
