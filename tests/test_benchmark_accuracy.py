@@ -197,6 +197,20 @@ def test_the_gate_tells_what_got_worse(unmapped, capsys):
     assert json.loads(Path("baseline.json").read_text()) == saved  # only the switch changes it
 
 
+def test_a_change_is_compared_with_the_configuration_as_it_is(unmapped, capsys):
+    assert command.main([*unmapped, "--update-baseline"]) == 0
+    capsys.readouterr()
+    assert command.main([*unmapped, "--override", "epochs=2"]) == 0
+    assert command.main([*unmapped, "--override", "grid_share=0.5"]) == 1
+    out = capsys.readouterr().out
+    assert out.count("compared with the configuration as it is") == 2
+    assert (
+        out[out.index("WORSE") :]
+        .splitlines()[1]
+        .startswith("  house_depth light served: visible_cm 1.00 -> 1.50")
+    )
+
+
 def test_peers_stand_beside_whole_streams_only(unmapped, capsys):
     command.main([*unmapped, "--seeds", "0", "2"])
     lines = capsys.readouterr().out.splitlines()

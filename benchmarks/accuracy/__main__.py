@@ -88,13 +88,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     drawn = figure.save_figure(picture, groups, peers)
     print(f"wrote {picture}" if drawn else "no figure of the error over time: it needs matplotlib")
 
-    if overrides or options.ablation:
-        print("not compared with the baseline: the configuration was changed")
+    if options.ablation:
+        print("not compared with the baseline: many configurations of one name")
         return 0
     if options.update_baseline:
         gate.update_baseline(options.baseline, records)
         print(f"wrote {options.baseline}")
         return 0
+    if overrides:
+        print("what was changed is compared with the configuration as it is")
     verdict = gate.compare(gate.load_baseline(options.baseline), records)
     for heading, lines in (
         ("not compared", verdict.skipped),

@@ -81,7 +81,7 @@ def compare(baseline: Baseline, records: Sequence[dict[str, Any]]) -> Verdict:
 
     Args:
         baseline: From `load_baseline`.
-        records: From `measure`, without overrides.
+        records: From `measure`, of one configuration for each name.
 
     Returns:
         The verdict.
@@ -138,7 +138,7 @@ def by_map(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], list[dict
     """Groups runs that differ in their seeds alone.
 
     Args:
-        records: From `measure`, without overrides.
+        records: From `measure`, of one configuration for each name.
 
     Returns:
         {(stream, configuration): records}.
