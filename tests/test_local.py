@@ -32,11 +32,12 @@ def test_brute_force_distance_against_a_tree():
 
 
 def test_tiles_do_not_change_the_distance(monkeypatch):
-    points, queries = cloud(), cloud(300) + 0.1
+    points, queries = cloud() + 9, cloud(300)  # what fills up the last tile must not be nearer
     whole = local.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
-    monkeypatch.setattr(local, "_TILE_PAIRS", 700 * 7)
-    tiled = local.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
-    np.testing.assert_array_equal(whole, tiled)
+    for tile in (1, 64, 700):  # 64 leaves a rest
+        monkeypatch.setattr(local, "_TILE", tile)
+        tiled = local.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
+        np.testing.assert_allclose(tiled, whole, rtol=3e-7)
 
 
 def test_samples_follow_equations_1_and_2():
