@@ -33,7 +33,7 @@ _SHEET_VOXELS = 2.0
 # Where no ray came by, the plane of a patch tells its side up to here, voxels.
 _GUESS_VOXELS = 3.0
 
-# Shifts that one loop iteration of a pass tries in either direction.
+# Shifts in either direction that a pass tries at a time.
 _CHUNK = 8
 
 
@@ -99,39 +99,31 @@ def _pass(
     axis is the same as there.
     """
     reach = min(horizon + 1, squared.shape[axis] - 1)
-    chunks = -(-reach // _CHUNK)
     margin = [(0, 0)] * 3
-    margin[axis] = (chunks * _CHUNK, chunks * _CHUNK)
+    margin[axis] = (reach, reach)
     across = jnp.pad(squared - along * along, margin, constant_values=_INFINITE)
     along = jnp.pad(along, margin)
 
-    def better(best: jax.Array, shift: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-        start = first + chunks * _CHUNK + k
-        there = jax.lax.dynamic_slice_in_dim(along, start, length, axis)
-        candidate = jax.lax.dynamic_slice_in_dim(across, start, length, axis) + (k + there) ** 2
-        return jnp.minimum(best, candidate), jnp.where(candidate < best, k, shift)
+    def part(array: jax.Array, size: int) -> jax.Array:
+        return jax.lax.dynamic_slice_in_dim(array, first, size, axis)
 
-    def more(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        chunk, best, _ = carry
-        # A site k voxels on is at least k - 1/2 away.
-        least = (chunk * _CHUNK + 0.5) ** 2
-        return (chunk < chunks) & (least < jnp.max(jnp.minimum(best, horizon**2)))
+    def shifted(array: jax.Array, shift: int) -> jax.Array:
+        return jax.lax.slice_in_dim(array, reach + shift, reach + shift + length, axis=axis)
 
-    def step(
-        carry: tuple[jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        chunk, best, shift = carry
-        for k in range(1, _CHUNK + 1):
-            for sign in (-1, 1):
-                best, shift = better(best, shift, sign * (chunk * _CHUNK + k))
-        return chunk + 1, best, shift
-
-    best = jax.lax.dynamic_slice_in_dim(squared, first, length, axis)
-    start = (jnp.int32(0), best, jnp.zeros(best.shape, jnp.int32))
-    if jax.default_backend() == "cpu":
-        _, best, shift = jax.lax.while_loop(more, step, start)
-    else:  # To ask for more takes a GPU longer than to do it all, since it waits for the host.
-        _, best, shift = jax.lax.fori_loop(0, chunks, lambda _, carry: step(carry), start)
+    # Cut out once, so that all the shifts are known to the compiler; and a few of them at a time:
+    # the barriers keep XLA from computing what they have in common for each shift again.
+    best = part(squared, length)
+    shift = jnp.zeros(best.shape, jnp.int32)
+    across, along = jax.lax.optimization_barrier(
+        (part(across, length + 2 * reach), part(along, length + 2 * reach))
+    )
+    for k in range(1, reach + 1):
+        for step in (-k, k):
+            candidate = shifted(across, step) + (step + shifted(along, step)) ** 2
+            shift = jnp.where(candidate < best, step, shift)
+            best = jnp.minimum(best, candidate)
+        if k % _CHUNK == 0 or k == reach:
+            best, shift = jax.lax.optimization_barrier((best, shift))
     return best, shift
 
 
