@@ -15,6 +15,8 @@ import hiosdf_jax as hio
 from benchmarks.speed import __main__ as command
 from benchmarks.speed import baselines, limits, rows, stages, tasks
 from hiosdf_jax import datasets
+from hiosdf_jax.grid import distance
+from hiosdf_jax.grid.change import Window
 from hiosdf_jax.network import passes, siren, training
 from hiosdf_jax.samples import Samples
 
@@ -204,6 +206,19 @@ def test_work_is_what_xla_counts():
     assert once == pytest.approx(operations(gradient, network.params), rel=0.05)
     asked = operations(lambda p: passes.value_and_gradient(10.0, p, points), network.params)
     assert limits.network_query_work(config, 600).matrix == pytest.approx(asked, rel=0.1)
+
+
+def test_the_distance_transform_s_work_is_what_xla_is_given():
+    config = hio.Config.light(((0, 0, 0), (4, 3, 2)))
+    window = Window((5, 0, 0), (30, 30, 20), (8, 2, 0), (20, 24, 20))
+    part = distance.Part(window.within, window.inner_shape)
+    sites, offset = jnp.zeros(window.shape, bool), jnp.zeros((*window.shape, 3))
+
+    def search(sites, offset):
+        return distance.nearest_sites(sites, offset, config.horizon_voxels, part)
+
+    counted = jax.jit(search).lower(sites, offset).cost_analysis()["flops"]
+    assert limits.distance_work(config, window).vector == pytest.approx(2 * counted, rel=0.1)
 
 
 def test_a_row_stands_beside_its_baselines():

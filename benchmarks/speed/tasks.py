@@ -288,7 +288,7 @@ def stage_rows(bench: Bench, label: str) -> list[Row]:
     features, doubtful = _sites(config, grid, searched)
     work = {
         "training": limits.training_work(config),
-        "distance": limits.distance_work(searched),
+        "distance": limits.distance_work(config, searched),
         "local samples": limits.nearest_work(len(queries), len(cloud)),
     }
     compare = {"training": "training", "local samples": "nearest", "distance": "distance"}
