@@ -53,7 +53,7 @@ class Config:
         frequency: The SIREN's omega_0 [IV-A].
         sdf_weight: Weight of the L1 distance loss [IV-D].
         eikonal_weight: Weight of the Eikonal loss [IV-D].
-        eikonal_every: The Eikonal loss takes each n-th sample, other ones in each epoch.
+        eikonal_every: The Eikonal loss takes one sample in n, other ones in each epoch.
         learning_rate: Of AdamW [IV-D].
         weight_decay: Of AdamW [IV-D].
         batches: Steps an epoch makes, each on its share of the samples; 1 is the paper's

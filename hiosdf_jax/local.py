@@ -78,6 +78,6 @@ def nearest_distance(queries: jax.Array, points: jax.Array, valid: jax.Array) ->
         square = sum((tile[:, k] - queries[:, k, None]) ** 2 for k in range(3))
         return jnp.minimum(least, jnp.min(square, axis=1)), None
 
-    start = jnp.full(queries.shape[0], jnp.inf, jnp.float32)
+    start = jnp.full(queries.shape[0], jnp.inf, jnp.result_type(queries, points))
     square, _ = jax.lax.scan(compare, start, points.reshape(-1, size, 3))
     return jnp.where(square < 1e29, jnp.sqrt(square), jnp.inf)

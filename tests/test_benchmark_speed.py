@@ -1,6 +1,7 @@
 """The speed benchmark on tiny sizes: every row has numbers, and its parts are what they say."""
 
 import dataclasses
+import functools
 import json
 import math
 import types
@@ -209,16 +210,23 @@ def test_work_is_what_xla_counts():
 
 
 def test_the_distance_transform_s_work_is_what_xla_is_given():
-    config = hio.Config.light(((0, 0, 0), (4, 3, 2)))
     window = Window((5, 0, 0), (30, 30, 20), (8, 2, 0), (20, 24, 20))
     part = distance.Part(window.within, window.inner_shape)
     sites, offset = jnp.zeros(window.shape, bool), jnp.zeros((*window.shape, 3))
 
-    def search(sites, offset):
-        return distance.nearest_sites(sites, offset, config.horizon_voxels, part)
+    def counted(horizon):  # (0, 2, 1): the short axes of the bounds first
+        search = functools.partial(
+            distance.nearest_sites, horizon=horizon, part=part, order=(0, 2, 1)
+        )
+        return jax.jit(search).lower(sites, offset).cost_analysis()["flops"]
 
-    counted = jax.jit(search).lower(sites, offset).cost_analysis()["flops"]
-    assert limits.distance_work(config, window).vector == pytest.approx(2 * counted, rel=0.1)
+    def work(horizon):
+        config = hio.Config.light(((0, 0, 0), (2, 4, 3)), distance_horizon=horizon / 10)
+        return limits.distance_work(config, window).vector
+
+    # The difference: what is done once, however far a pass looks, is not counted.
+    assert work(12) - work(6) == pytest.approx(2 * (counted(12) - counted(6)), rel=0.02)
+    assert work(12) == pytest.approx(2 * work(6))
 
 
 def test_a_row_stands_beside_its_baselines():

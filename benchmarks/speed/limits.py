@@ -154,7 +154,7 @@ def distance_work(config: Config, window: Window) -> Work:
     """
     shape, compared = list(window.shape), 0
     for axis in sorted(range(3), key=lambda k: config.grid_shape[k]):
-        reach = min(config.horizon_voxels + 1, shape[axis] - 1)
+        reach = min(config.horizon_voxels, shape[axis] - 1)
         shape[axis] = window.inner_shape[axis]
         compared += 2 * reach * math.prod(shape)
     memory = 30.0 * math.prod(window.shape) + 7.0 * math.prod(window.inner_shape)

@@ -63,9 +63,8 @@ def nearest_sites(
         offset: (X, Y, Z, 3) of the site from its voxel's centre, voxels, in [-0.5, 0.5].
         horizon: Sites farther than this along an axis are not looked for, voxels.
         part: The voxels to find them for; by default all.
-        order: Of the passes. Best first along the axis on which sites are nearest, as on that of
-            the floor and the ceiling: the others then need few shifts. Where sites lie off their
-            voxels' centres the answer can depend on it.
+        order: Of the passes. Each one cuts the box down to the part along its axis. Where sites lie
+            off their voxels' centres the answer can depend on it.
 
     Returns:
         nearest: (A, B, C) int32, the flat index of the nearest site's voxel; -1 where none is
@@ -98,7 +97,7 @@ def _pass(
     The candidate of a voxel k further on is at k + along from here, and its distance across the
     axis is the same as there.
     """
-    reach = min(horizon + 1, squared.shape[axis] - 1)
+    reach = min(horizon, squared.shape[axis] - 1)
     margin = [(0, 0)] * 3
     margin[axis] = (reach, reach)
     across = jnp.pad(squared - along * along, margin, constant_values=_INFINITE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -53,7 +54,7 @@ def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> 
         config: The map's configuration.
         params: The network's weights.
         points: (N, 3) the samples' points relative to the network's origin, m.
-        samples: The samples, in random order but for that.
+        samples: The samples.
 
     Returns:
         Their means over the samples with weight.
@@ -176,7 +177,9 @@ def _turn(config: Config, batches: Samples, epoch: jax.Array) -> Samples:
     """
     if config.eikonal_every == 1:
         return batches
-    places = -epoch * _sloped(config, batches)
+    size, sloped = batches.weight.shape[2], _sloped(config, batches)
+    turns = size // math.gcd(size, sloped)  # after so many all is where it was
+    places = -(epoch % turns) * sloped
     return jax.tree.map(lambda array: jnp.roll(array, places, axis=2), batches)
 
 
