@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from benchmarks.speed.rows import Row, single, time_ms
 from hiosdf_jax.config import Config
 from hiosdf_jax.grid.change import Window
+from hiosdf_jax.grid.distance import pass_order
 from hiosdf_jax.network import passes
 
 
@@ -153,7 +154,7 @@ def distance_work(config: Config, window: Window) -> Work:
     nearest (3) in int8, sdf and doubt in float16, 7 bytes a voxel that can have changed.
     """
     shape, compared = list(window.shape), 0
-    for axis in sorted(range(3), key=lambda k: config.grid_shape[k]):
+    for axis in pass_order(config):
         reach = min(config.horizon_voxels, shape[axis] - 1)
         shape[axis] = window.inner_shape[axis]
         compared += 2 * reach * math.prod(shape)

@@ -84,6 +84,11 @@ def nearest_sites(
     return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
 
 
+def pass_order(config: Config) -> list[int]:
+    """Short axes first: of the grid, since all windows must give the same answer."""
+    return sorted(range(3), key=lambda k: config.grid_shape[k])
+
+
 def _pass(
     squared: jax.Array,
     along: jax.Array,
@@ -161,8 +166,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
         )
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
-    # Short axes first: of the grid, since all windows must give the same answer.
-    order = sorted(range(3), key=lambda k: config.grid_shape[k])
+    order = pass_order(config)
     features = surface.is_feature(config, hits, passes, axes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part, order)
     doubtful = surface.is_doubtful(hits, passes)
