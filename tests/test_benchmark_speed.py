@@ -150,25 +150,26 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
     monkeypatch.setattr(tasks.hio, "update", update)
     extent = datasets.Extent(BOUNDS, CONFIG.max_range)
     bench = tasks.Bench(TINY, tmp_path, [room_cloud(0)], extent, deadline=math.inf)
-    found = tasks.cloud_size_rows(bench)
-    assert [row.name for row in found] == [
+    found = tasks.size_rows(bench)
+    clouds, maps = found[:4], found[4:]
+    assert [row.name for row in clouds] == [
         "update, light, 200 points, 300 used",
         "update, light, 200 points, all used",
         "update, light, 500 points, 300 used",
         "update, light, 500 points, all used",
     ]
-    assert {(config.max_points, count) for config, count in given} == {
-        (300, 200),
-        (200, 200),
-        (300, 500),
-        (500, 500),
+    assert [row.note for row in maps] == ["20x20x16 voxels", "40x40x16 voxels"]
+    assert [row.compare for row in maps] == ["", "map size"]
+    assert bench.baselines["map size"][0].spread == maps[0].spread
+    whole = bench.config("light").grid_shape
+    assert {(config.grid_shape, config.max_points, count) for config, count in given} == {
+        (whole, 300, 200),
+        (whole, 200, 200),
+        (whole, 300, 500),
+        (whole, 500, 500),
+        ((20, 20, 16), 300, 250),
+        ((40, 40, 16), 300, 250),
     }
-    given.clear()
-    found = tasks.map_size_rows(bench)
-    assert [row.note for row in found] == ["20x20x16 voxels", "40x40x16 voxels"]
-    assert [row.compare for row in found] == ["", "map size"]
-    assert bench.baselines["map size"][0].spread == found[0].spread
-    assert {config.grid_shape for config, _ in given} == {(20, 20, 16), (40, 40, 16)}
 
 
 def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):

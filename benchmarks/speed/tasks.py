@@ -189,8 +189,7 @@ def plan(bench: Bench) -> Iterator[tuple[str, Task]]:
     yield "training, the paper's", lambda: paper_training_rows(bench)
     yield "network queries", lambda: network_query_rows(bench)
     yield "queries", lambda: query_rows(bench, "default" if "default" in configs else apart)
-    yield "cloud sizes", lambda: cloud_size_rows(bench)
-    yield "map sizes", lambda: map_size_rows(bench)
+    yield "cloud and map sizes", lambda: size_rows(bench)
     yield "endurance", lambda: endurance_rows(bench)
 
 
@@ -373,8 +372,19 @@ def query_rows(bench: Bench, label: str) -> list[Row]:
     return [*rows, Row(f"bake, {label}", "ms", baking, note=samples)]
 
 
-def cloud_size_rows(bench: Bench) -> list[Row]:
-    """Updates by clouds of several sizes: drawn or padded to one size, and all of them used."""
+def size_rows(bench: Bench) -> list[Row]:
+    """Updates by clouds and of maps of several sizes."""
+    clouds, maps = _cloud_size_updates(bench), _map_size_configs(bench)
+    first = (
+        functools.partial(hio.update, hio.init(config, jax.random.key(0)), *bench.frame(0))
+        for config in maps.values()
+    )
+    _call_all([*clouds.values(), *first])
+    return [*_cloud_size_rows(bench, clouds), *_map_size_rows(bench, maps)]
+
+
+def _cloud_size_updates(bench: Bench) -> dict[str, Callable[[], MapState]]:
+    """Updates by clouds that are drawn or padded to one size, and by all of their points."""
     rng = np.random.default_rng(0)
     cloud, pose = bench.frame(0)
     cloud = cloud[np.isfinite(cloud).all(axis=-1)]
@@ -389,7 +399,10 @@ def cloud_size_rows(bench: Bench) -> list[Row]:
             state = hio.init(config, jax.random.key(0))
             update = functools.partial(hio.update, state, sized, pose)
             updates[f"update, light, {count:,} points, {how}"] = update
-    _call_all(updates.values())
+    return updates
+
+
+def _cloud_size_rows(bench: Bench, updates: dict[str, Callable[[], MapState]]) -> list[Row]:
     rows = []
     for name, update in tqdm(updates.items(), desc="cloud sizes", leave=False):
         if bench.out_of_time():
@@ -398,8 +411,8 @@ def cloud_size_rows(bench: Bench) -> list[Row]:
     return rows
 
 
-def map_size_rows(bench: Bench) -> list[Row]:
-    """Updates of maps of several sizes around one sensor; the smallest is the baseline."""
+def _map_size_configs(bench: Bench) -> dict[str, hio.Config]:
+    """Maps of several sizes around one sensor."""
     (_, _, low), (_, _, high) = bench.extent.bounds
     x, y, _ = bench.frame(0)[1][:3, 3].tolist()
     configs = {}
@@ -407,10 +420,11 @@ def map_size_rows(bench: Bench) -> list[Row]:
         half = edge / 2
         bounds = ((x - half, y - half, low), (x + half, y + half, high))
         configs[f"a map of {edge:g} m"] = bench.config("light", bounds=bounds, warmup_updates=0)
-    _call_all(
-        functools.partial(hio.update, hio.init(config, jax.random.key(0)), *bench.frame(0))
-        for config in configs.values()
-    )
+    return configs
+
+
+def _map_size_rows(bench: Bench, configs: dict[str, hio.Config]) -> list[Row]:
+    """The smallest map is the baseline."""
     rows, first = [], next(iter(configs))
     for name, config in tqdm(configs.items(), desc="map sizes", leave=False):
         if bench.out_of_time():
