@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import math
+import os
 import types
 
 import jax
@@ -150,26 +151,30 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
     monkeypatch.setattr(tasks.hio, "update", update)
     extent = datasets.Extent(BOUNDS, CONFIG.max_range)
     bench = tasks.Bench(TINY, tmp_path, [room_cloud(0)], extent, deadline=math.inf)
-    found = tasks.size_rows(bench)
-    clouds, maps = found[:4], found[4:]
-    assert [row.name for row in clouds] == [
+    assert tasks.compile_sizes(bench) == []
+    compiled = {(config.grid_shape, config.max_points) for config, _ in given}
+    given.clear()
+    found = tasks.cloud_size_rows(bench)
+    assert [row.name for row in found] == [
         "update, light, 200 points, 300 used",
         "update, light, 200 points, all used",
         "update, light, 500 points, 300 used",
         "update, light, 500 points, all used",
     ]
-    assert [row.note for row in maps] == ["20x20x16 voxels", "40x40x16 voxels"]
-    assert [row.compare for row in maps] == ["", "map size"]
-    assert bench.baselines["map size"][0].spread == maps[0].spread
-    whole = bench.config("light").grid_shape
-    assert {(config.grid_shape, config.max_points, count) for config, count in given} == {
-        (whole, 300, 200),
-        (whole, 200, 200),
-        (whole, 300, 500),
-        (whole, 500, 500),
-        ((20, 20, 16), 300, 250),
-        ((40, 40, 16), 300, 250),
+    assert {(config.max_points, count) for config, count in given} == {
+        (300, 200),
+        (200, 200),
+        (300, 500),
+        (500, 500),
     }
+    whole = {(config.grid_shape, config.max_points) for config, _ in given}
+    given.clear()
+    found = tasks.map_size_rows(bench)
+    assert [row.note for row in found] == ["20x20x16 voxels", "40x40x16 voxels"]
+    assert [row.compare for row in found] == ["", "map size"]
+    assert bench.baselines["map size"][0].spread == found[0].spread
+    assert {config.grid_shape for config, _ in given} == {(20, 20, 16), (40, 40, 16)}
+    assert compiled == whole | {(config.grid_shape, config.max_points) for config, _ in given}
 
 
 def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):
@@ -185,6 +190,13 @@ def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkey
     assert "1.50" in table
     assert command.main([*arguments, "--minutes", "0"]) == 0
     assert "not run" in capsys.readouterr().out
+    assert command.main([*arguments, "--only", "oun", "nothing"]) == 0
+    record = json.loads((tmp_path / "speed.json").read_text("utf-8"))
+    assert [row["name"] for row in record["rows"]] == ["sound"]
+    assert record["host"].endswith(f"{os.cpu_count()} cores")
+    with pytest.raises(SystemExit):
+        command.main([*arguments, "--only", "nothing"])
+    assert "'broken', 'sound'" in capsys.readouterr().err
 
 
 def test_work_is_what_xla_counts():

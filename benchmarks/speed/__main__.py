@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
+import platform
 import sys
 import time
 import traceback
@@ -37,15 +39,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.endurance is not None:
         sizes = dataclasses.replace(sizes, endurance=options.endurance)
     bench = open_bench(options.stream, sizes, began + 60 * options.minutes)
+    tasks = list(plan(bench))
+    if options.only:
+        chosen = [task for task in tasks if any(part in task[0] for part in options.only)]
+        if not chosen:
+            names = ", ".join(repr(name) for name, _ in tasks)
+            parser.error(f"--only {' '.join(options.only)}: in the name of no task: {names}")
+        tasks = chosen
     rows: list[Row] = []
-    with tqdm(list(plan(bench)), unit="task") as progress:
+    with tqdm(tasks, unit="task") as progress:
         for name, task in progress:
             progress.set_description(name)
             rows += _run(bench, name, task)
             _write(options.output, options.stream.stem, bench, rows)  # if it is cut off
     device = jax.devices()[0].device_kind
     took = time.perf_counter() - began
-    print(f"{options.stream.stem}, {device}, jax {jax.__version__}, {took:.0f} s in all")
+    print(f"{options.stream.stem}, {device}, {_host()}, jax {jax.__version__}, {took:.0f} s in all")
     print(format_table(rows, bench.baselines))
     print(f"wrote {options.output}")
     return 1 if any(row.failed for row in rows) else 0
@@ -68,6 +77,7 @@ def _write(path: Path, stream: str, bench: Bench, rows: list[Row]) -> None:
     record = {
         "stream": stream,
         "device": jax.devices()[0].device_kind,
+        "host": _host(),
         "jax": jax.__version__,
         "sizes": dataclasses.asdict(bench.sizes),
         "rows": [dataclasses.asdict(row) for row in rows],
@@ -80,6 +90,14 @@ def _write(path: Path, stream: str, bench: Bench, rows: list[Row]) -> None:
     path.write_text(json.dumps(to_json(record), indent=1) + "\n", "utf-8")
 
 
+def _host() -> str:
+    """The host's processor and its cores."""
+    known = Path("/proc/cpuinfo")
+    lines = known.read_text("utf-8").splitlines() if known.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{[*models, platform.processor()][0]}, {os.cpu_count()} cores"
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.speed",
@@ -90,6 +108,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--quick", action="store_true", help="smaller sizes, for two CPU cores: light alone"
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="PART",
+        help="tasks with one of these in their names (stages and queries need an update's task)",
     )
     parser.add_argument(
         "--endurance",

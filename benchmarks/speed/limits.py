@@ -1,4 +1,4 @@
-"""What the machine can do, measured, and what a stage has to do at the least, counted.
+"""What the machine can do, measured, and what a stage's algorithm has to do, counted.
 
 The share of the limit that a stage reaches is the least time that its operations or its bytes take
 on this machine over the time that it took.
@@ -34,7 +34,7 @@ class Limits(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What a stage has to do at the least.
+    """What a stage's algorithm has to do: its operations, and its least traffic.
 
     Attributes:
         matrix: Operations in matrix products, a multiply-add being two.
@@ -57,7 +57,8 @@ def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, li
 
     Args:
         matrix_edge: Rows and columns of the matrices.
-        elements: float32 numbers in the arrays that are copied.
+        elements: float32 numbers in the arrays that are copied and computed with; so many that an
+            accelerator takes longer for them than to be called.
         seconds: How long to time each.
 
     Returns:
@@ -76,11 +77,10 @@ def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, li
             several = [one * factor + x for one in several]
         return sum(several, jnp.zeros_like(x))
 
-    few = numbers[: max(1, elements // 16)]
-    chained = time_ms(jax.jit(chains), few, jnp.float32(0.5), seconds=seconds)
+    chained = time_ms(jax.jit(chains), numbers, jnp.float32(0.5), seconds=seconds)
     limits = Limits(
         matrix=2.0 * matrix_edge**3 / (1e-3 * product.median),
-        vector=2.0 * _STEPS * _CHAINS * few.size / (1e-3 * chained.median),
+        vector=2.0 * _STEPS * _CHAINS * elements / (1e-3 * chained.median),
         memory=2.0 * numbers.nbytes / (1e-3 * copied.median),
     )
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -189,7 +189,9 @@ def plan(bench: Bench) -> Iterator[tuple[str, Task]]:
     yield "training, the paper's", lambda: paper_training_rows(bench)
     yield "network queries", lambda: network_query_rows(bench)
     yield "queries", lambda: query_rows(bench, "default" if "default" in configs else apart)
-    yield "cloud and map sizes", lambda: size_rows(bench)
+    yield "compiling by sizes", lambda: compile_sizes(bench)
+    yield "cloud sizes", lambda: cloud_size_rows(bench)
+    yield "map sizes", lambda: map_size_rows(bench)
     yield "endurance", lambda: endurance_rows(bench)
 
 
@@ -372,19 +374,19 @@ def query_rows(bench: Bench, label: str) -> list[Row]:
     return [*rows, Row(f"bake, {label}", "ms", baking, note=samples)]
 
 
-def size_rows(bench: Bench) -> list[Row]:
-    """Updates by clouds and of maps of several sizes."""
-    clouds, maps = _cloud_size_updates(bench), _map_size_configs(bench)
-    first = (
+def compile_sizes(bench: Bench) -> list[Row]:
+    """Compiles the updates of the next two tasks, at once on as many cores as there are."""
+    first = [
         functools.partial(hio.update, hio.init(config, jax.random.key(0)), *bench.frame(0))
-        for config in maps.values()
-    )
-    _call_all([*clouds.values(), *first])
-    return [*_cloud_size_rows(bench, clouds), *_map_size_rows(bench, maps)]
+        for config in _map_size_configs(bench).values()
+    ]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        calls = [*_cloud_size_updates(bench).values(), *first]
+        jax.block_until_ready(list(pool.map(lambda call: call(), calls)))
+    return []
 
 
 def _cloud_size_updates(bench: Bench) -> dict[str, Callable[[], MapState]]:
-    """Updates by clouds that are drawn or padded to one size, and by all of their points."""
     rng = np.random.default_rng(0)
     cloud, pose = bench.frame(0)
     cloud = cloud[np.isfinite(cloud).all(axis=-1)]
@@ -402,8 +404,9 @@ def _cloud_size_updates(bench: Bench) -> dict[str, Callable[[], MapState]]:
     return updates
 
 
-def _cloud_size_rows(bench: Bench, updates: dict[str, Callable[[], MapState]]) -> list[Row]:
-    rows = []
+def cloud_size_rows(bench: Bench) -> list[Row]:
+    """Updates by clouds of several sizes: drawn or padded to one size, and all of them used."""
+    rows, updates = [], _cloud_size_updates(bench)
     for name, update in tqdm(updates.items(), desc="cloud sizes", leave=False):
         if bench.out_of_time():
             return [*rows, Row(name, note=OUT_OF_TIME)]
@@ -412,7 +415,6 @@ def _cloud_size_rows(bench: Bench, updates: dict[str, Callable[[], MapState]]) -
 
 
 def _map_size_configs(bench: Bench) -> dict[str, hio.Config]:
-    """Maps of several sizes around one sensor."""
     (_, _, low), (_, _, high) = bench.extent.bounds
     x, y, _ = bench.frame(0)[1][:3, 3].tolist()
     configs = {}
@@ -423,9 +425,10 @@ def _map_size_configs(bench: Bench) -> dict[str, hio.Config]:
     return configs
 
 
-def _map_size_rows(bench: Bench, configs: dict[str, hio.Config]) -> list[Row]:
-    """The smallest map is the baseline."""
-    rows, first = [], next(iter(configs))
+def map_size_rows(bench: Bench) -> list[Row]:
+    """Updates of maps of several sizes around one sensor; the smallest is the baseline."""
+    rows, configs = [], _map_size_configs(bench)
+    first = next(iter(configs))
     for name, config in tqdm(configs.items(), desc="map sizes", leave=False):
         if bench.out_of_time():
             return [*rows, Row(f"update, light, {name}", note=OUT_OF_TIME)]
@@ -500,12 +503,6 @@ def _map_frames(
         state = jax.block_until_ready(hio.update(state, cloud, pose))
         times_ms.append(1e3 * (time.perf_counter() - start))
     return state, times_ms[warmup:], 1e-3 * (times_ms[0] - times_ms[1])
-
-
-def _call_all(calls: Iterable[Callable[[], Any]]) -> None:
-    """Calls functions for the first time, to compile them at once on as many cores as there are."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        jax.block_until_ready(list(pool.map(lambda call: call(), calls)))
 
 
 def _trainer(config: hio.Config) -> Callable[..., Any]:
