@@ -174,6 +174,32 @@ def test_patches_are_the_weighted_moments_of_all_hits():
     assert checked >= 12
 
 
+@pytest.mark.parametrize("hits", [1, 2])
+def test_the_normal_of_too_few_hits_is_towards_the_sensor(hits):
+    """Not what rounding makes of it: it tells the side of voxels that no ray has met."""
+    rng = np.random.default_rng(12)
+    sensor = np.array([2.0, -1.5, 1.7])
+    cells = np.argwhere(rng.random(SHAPE) < 0.3)
+    centers = (cells + CONFIG.corner_index + 0.5) * 0.1
+    points = centers[:, None] + rng.uniform(-0.04, 0.04, (len(cells), hits, 3))
+    grid = fuse(empty_grid(), points.reshape(-1, 3).astype(np.float32), sensor)
+    axes = np.asarray(grid.surface.axes, np.float64)[tuple(cells.T)]
+    offsets = (points - centers[:, None]) / 0.1
+    a, b = CONFIG.range_noise
+    weight = 1 / (1 + b / a * np.sum((points - sensor) ** 2, axis=-1, keepdims=True)) ** 2
+    mean = np.sum(weight * offsets, axis=1) / np.sum(weight, axis=1)
+    expected = (sensor - centers) / 0.1 - mean
+    if hits == 2:
+        line = offsets[:, 1] - offsets[:, 0]
+        line /= np.linalg.norm(line, axis=1)[:, None]
+        expected -= np.sum(expected * line, axis=1)[:, None] * line
+        assert np.abs(np.sum(axes[:, 1] * line, axis=1)).max() < 1e-5
+        assert np.abs(np.sum(axes[:, 1] * axes[:, 2], axis=1)).max() < 1e-8
+    expected /= np.linalg.norm(expected, axis=1)[:, None]
+    assert len(cells) > 200
+    np.testing.assert_allclose(axes[:, 2], 1e-3 * expected, atol=5e-6)
+
+
 def test_invalid_rows_and_points_outside_change_nothing():
     points = uniform(4, 50)
     padded = np.concatenate([points, uniform(5, 30), np.full((20, 3), 7.0, np.float32)])

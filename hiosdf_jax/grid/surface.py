@@ -23,6 +23,9 @@ _EXTENT_DEVIATIONS = 0.9 * 3**0.5
 # Axes shorter than this (voxels) are stored with it, so that a perfect plane keeps its normal.
 _LEAST_DEVIATION = 1e-3
 
+# Axes shorter than this (voxels), twice the least, have no direction but that of rounding.
+_LEAST_DIRECTED = 2e-3
+
 _JACOBI_SWEEPS = 5
 
 # Patches smaller than this (voxels^2) are asked for as many hits as one of this area: stray returns
@@ -101,8 +104,7 @@ def fuse_hits(
     target_index = jnp.stack(jnp.unravel_index(jnp.minimum(target, voxels - 1), shape), axis=-1)
     center_world = geometry.voxel_center(config, start + target_index)
     to_sensor = (sensor_world - center_world) / config.voxel_size - mean
-    faces_away = jnp.sum(direction[:, 2] * to_sensor, axis=-1) < 0
-    direction = direction.at[:, 2].multiply(jnp.where(faces_away, -1.0, 1.0)[:, None])
+    direction = _face_sensor(deviation, direction, to_sensor)
     axes = jnp.maximum(deviation, _LEAST_DEVIATION)[:, :, None] * direction
 
     def put(array: jax.Array, values: jax.Array) -> jax.Array:
@@ -116,6 +118,32 @@ def fuse_hits(
             mean=put(window.surface.mean, mean), axes=put(window.surface.axes, axes)
         ),
     )
+
+
+def _face_sensor(deviation: jax.Array, direction: jax.Array, to_sensor: jax.Array) -> jax.Array:
+    """Turns the last principal axis, the normal, to the sensor's side.
+
+    Two hits, or several on a line, do not tell it: then it is what the line leaves of the direction
+    to the sensor, since the surface was seen from there.
+
+    Args:
+        deviation: (N, 3) along the axes, descending, voxels.
+        direction: (N, 3, 3) the axes, unit vectors as rows.
+        to_sensor: (N, 3) voxels.
+
+    Returns:
+        (N, 3, 3) the axes.
+    """
+    along = jnp.sum(direction * to_sensor[:, None, :], axis=-1)
+    told = deviation >= _LEAST_DIRECTED
+    faces_away = along[:, 2:] < 0
+    first, normal = direction[:, 0], jnp.where(faces_away, -1.0, 1.0) * direction[:, 2]
+    across = to_sensor - jnp.where(told[:, :1], along[:, :1], 0) * first
+    far = length(split(across))[:, None]
+    line = ~told[:, 1:2] & (far > 1e-3)
+    normal = jnp.where(line, across / jnp.maximum(far, 1e-3), normal)
+    middle = jnp.where(line, jnp.cross(normal, first), direction[:, 1])
+    return jnp.stack([first, middle, normal], axis=1)
 
 
 def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Array) -> jax.Array:
