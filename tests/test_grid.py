@@ -473,8 +473,10 @@ def numpy_passes(sites, offset, horizon, part, order=(2, 1, 0)):
     return np.where(squared <= horizon**2, nearest, -1), squared
 
 
+@pytest.mark.parametrize("chunk", [1, 8, 100])
 @pytest.mark.parametrize(("share", "horizon"), [(0.0005, 9), (0.0005, 16), (0.002, 25), (0.02, 40)])
-def test_the_passes_against_numpy(share, horizon):
+def test_the_passes_against_numpy(monkeypatch, share, horizon, chunk):
+    monkeypatch.setattr(distance, "_CHUNK", chunk)
     rng = np.random.default_rng(11)
     sites = rng.random((40, 21, 13)) < share
     offset = rng.uniform(-0.5, 0.5, (*sites.shape, 3)).astype(np.float32)
