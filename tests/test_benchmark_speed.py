@@ -17,7 +17,8 @@ import hiosdf_jax as hio
 from benchmarks.speed import __main__ as command
 from benchmarks.speed import baselines, limits, rows, stages, tasks
 from hiosdf_jax import datasets
-from hiosdf_jax.grid import distance
+from hiosdf_jax.grid import distance, evidence, frontier
+from hiosdf_jax.grid.beams import place_cloud
 from hiosdf_jax.grid.change import Window
 from hiosdf_jax.network import passes, siren, training
 from hiosdf_jax.samples import Samples
@@ -104,13 +105,20 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
     assert found["resident memory, peak of hiosdf map"]["spread"]["median"] > 5
     note = found["6 updates in a row, light, all"]["note"]
     assert note.startswith("flags: none; medians of its tenths: ") and note.count(",") == 5
-    for name in ("training", "distance", "local samples"):
+    for name in taken_apart[0][-1]:
         assert found[f"{name}, light"]["limit"]
     for key in {row["compare"] for row in record["rows"]} - {""}:
         for baseline in record["baselines"][key]:
             assert baseline["spread"] or "torch" in baseline["reason"], baseline
     measured = {key for key, beside in record["baselines"].items() if beside[0]["spread"]}
-    assert measured >= {"import", "nearest", "distance", "endurance", "live arrays before"}
+    assert measured >= {
+        "import",
+        "nearest",
+        "distance",
+        "frontier",
+        "endurance",
+        "live arrays before",
+    }
 
     ((state, cloud, pose, parts),) = taken_apart
     assert_stages_make_the_update(parts, state, hio.update(state, cloud, pose))
@@ -167,6 +175,9 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
         (300, 500),
         (500, 500),
     }
+    assert [row.compare for row in found] == ["", *["cloud size"] * 3]
+    (baseline,) = bench.baselines["cloud size"]
+    assert baseline == rows.Baseline("200 points, 300 used", found[0].spread)
     whole = {(config.grid_shape, config.max_points) for config, _ in given}
     given.clear()
     found = tasks.map_size_rows(bench)
@@ -240,6 +251,52 @@ def test_the_distance_transform_s_work_is_what_xla_is_given():
     # The difference: what is done once, however far a pass looks, is not counted.
     assert work(12) - work(6) == pytest.approx(2 * (counted(12) - counted(6)), rel=0.02)
     assert work(12) == pytest.approx(2 * work(6))
+
+
+def test_the_frontier_s_work_is_what_xla_is_given():
+    window = Window((5, 0, 0), (30, 30, 10), (8, 2, 0), (20, 24, 10))
+    seen = jnp.zeros(window.shape, bool)
+
+    def counted(reach):
+        search = functools.partial(frontier.signed_box_distance, reach=reach)
+        return jax.jit(search).lower(seen).cost_analysis()["flops"]
+
+    def work(reach):
+        config = hio.Config.light(((0, 0, 0), (4, 4, 1)), frontier_horizon=reach / 10)
+        assert config.frontier_voxels == reach
+        return limits.frontier_work(config, window).vector
+
+    # Beyond 9 voxels the shortest axis has no more to compare.
+    assert work(12) - work(6) == pytest.approx(counted(12) - counted(6), rel=0.05)
+    assert work(6) == pytest.approx(counted(6), rel=0.2)
+
+
+def test_the_evidence_s_work_is_the_size_of_its_arrays():
+    state = hio.init(CONFIG, jax.random.key(0))
+    start, window = evidence.read_evidence(CONFIG, state.grid, jnp.zeros(3))
+    stored = evidence.write_evidence(state.grid, start, window)
+    assert window.hits.shape == CONFIG.grid_shape  # so that both have as many voxels
+
+    def size(grid, *names):
+        arrays = grid.__dict__ | grid.surface.__dict__
+        return sum(arrays[name].nbytes for name in names)
+
+    fused, traced = ("hits", "weight", "mean", "axes"), ("passes", "behind")
+    every = {*fused, *traced}
+    work = limits.evidence_work(window.hits.size, 300, 50.0)
+    assert work["window"].memory == size(state.grid, *every) + size(window, *every)
+    assert work["fading"].memory == size(window, *every) + size(stored, *every)
+    assert work["fusion"].memory == 2 * size(window, *fused) + 300 * 12
+    beams = place_cloud(CONFIG, jnp.ones((300, 3)), jnp.ones(300, bool), jnp.eye(4))
+    rays = (beams.directions_world, beams.free_ranges, beams.in_range, beams.ends)
+    read = sum(array.nbytes for array in rays)
+    assert work["rays"].memory == 2 * size(window, *traced) + read
+    surface, voxels = state.grid.surface, state.grid.hits.size
+    one_sample = (surface.nearest, surface.mean, surface.axes)
+    drawn = sum(array.nbytes for array in one_sample) / voxels + 4 * 5
+    each = size(state.grid, *traced, "hits", "sdf") / voxels + 1
+    samples = CONFIG.near_samples + CONFIG.far_samples
+    assert limits.grid_samples_work(CONFIG).memory == each * voxels + drawn * samples
 
 
 def test_a_row_stands_beside_its_baselines():

@@ -77,6 +77,18 @@ def distance(features: np.ndarray, doubtful: np.ndarray, seconds: float) -> list
     return _by_scipy("scipy distance_transform_edt on the CPU, twice", "ndimage", measure)
 
 
+def frontier(seen: np.ndarray, seconds: float) -> list[Baseline]:
+    """Distances from seen voxels to unseen ones and back, of the same window."""
+
+    def measure(ndimage: Any) -> Spread:
+        def transforms() -> Any:
+            return ndimage.distance_transform_edt(seen), ndimage.distance_transform_edt(~seen)
+
+        return time_ms(transforms, seconds=seconds)
+
+    return _by_scipy("scipy distance_transform_edt on the CPU, both ways", "ndimage", measure)
+
+
 def _by_torch(label: str, measure: Callable[[Any, Any, str], Spread]) -> list[Baseline]:
     """Measures in float32 and, on a GPU, with TF32 products."""
     try:

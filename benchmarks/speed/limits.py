@@ -1,7 +1,8 @@
 """What the machine can do, measured, and what a stage's algorithm has to do, counted.
 
 The share of the limit that a stage reaches is the least time that its operations or its bytes take
-on this machine over the time that it took.
+on this machine over the time that it took. It is above 1 where a cache holds what is counted as
+traffic of the memory.
 """
 
 from __future__ import annotations
@@ -160,6 +161,60 @@ def distance_work(config: Config, window: Window) -> Work:
         compared += 2 * reach * math.prod(shape)
     memory = 30.0 * math.prod(window.shape) + 7.0 * math.prod(window.inner_shape)
     return Work(vector=2 * 6.0 * compared, memory=memory)
+
+
+def evidence_work(window: int, points: int, steps: float) -> dict[str, Work]:
+    """Of the four stages that count rays in a window around the sensor.
+
+    Hits, passes, behind and weight are stored in 2 bytes a voxel each and counted in 4, the mean
+    and the axes (12 numbers) in 2. Fusion uses hits, weight, mean and axes, the rays passes and
+    behind. A point has 12 bytes, a ray 16 and two flags. A step along a ray takes 26 operations:
+    its point 6, the voxel of it 9, whether that is in the window 6, where it is stored 4, adding 1.
+
+    Args:
+        window: Its voxels.
+        points: Of the cloud.
+        steps: Of all of its rays.
+
+    Returns:
+        The work by the stage's name.
+    """
+    return {
+        "window": Work(memory=(32.0 + 40.0) * window),
+        "fusion": Work(memory=2 * 32.0 * window + 12.0 * points),
+        "rays": Work(vector=26.0 * steps, memory=2 * 8.0 * window + 18.0 * points),
+        "fading": Work(memory=(40.0 + 32.0) * window),
+    }
+
+
+def frontier_work(config: Config, window: Window) -> Work:
+    """Of the distance to unseen space: the comparisons, and the memory read and written once.
+
+    A pass compares each voxel with those within its reach along an axis, three operations each: a
+    choice, a sum, a minimum. Hits and passes are 4 bytes a voxel, an answer is 1.
+    """
+    reach = sum(min(config.frontier_voxels, length - 1) for length in window.shape)
+    voxels = math.prod(window.shape)
+    return Work(
+        vector=3.0 * 2 * reach * voxels,
+        memory=4.0 * voxels + 1.0 * math.prod(window.inner_shape),
+    )
+
+
+def grid_samples_work(config: Config) -> Work:
+    """Of drawing samples from the whole map.
+
+    Of each voxel hits, passes, behind, sdf and one number of nearest are read, 9 bytes; a sample
+    reads nearest, mean and axes of its voxels' patch, 27 bytes, and is written, 20.
+    """
+    samples = config.near_samples + config.far_samples
+    return Work(memory=9.0 * math.prod(config.grid_shape) + 47.0 * samples)
+
+
+def calibration_work(config: Config, points: int, returns: int) -> Work:
+    """Of asking the map at some returns of a cloud: the network, a flag a point, 39 bytes each."""
+    network = _network_work(config, returns, 1)
+    return network._replace(memory=network.memory + 1.0 * points + 39.0 * returns)
 
 
 def baked_work(points: int) -> Work:

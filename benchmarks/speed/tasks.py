@@ -23,9 +23,9 @@ from tqdm import tqdm
 import hiosdf_jax as hio
 from benchmarks.speed import baselines, limits, stages
 from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
-from hiosdf_jax import datasets, intake, mapping, served
+from hiosdf_jax import datasets, intake, mapping, served, uncertainty
 from hiosdf_jax.grid import geometry, lookup, surface
-from hiosdf_jax.grid.change import Window, place_windows
+from hiosdf_jax.grid.change import Change, Window, place_windows
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
 from hiosdf_jax.samples import Samples
@@ -277,28 +277,40 @@ def limit_rows(bench: Bench) -> list[Row]:
 
 
 def stage_rows(bench: Bench, label: str) -> list[Row]:
-    """Each stage by itself; scipy's search and distance transform beside two of them."""
+    """Each stage by itself; scipy's search and distance transforms beside three of them."""
     config, seconds = bench.config(label), bench.sizes.seconds
     parts = _take_apart(bench, label)
     cloud, valid, *_ = parts["local samples"].arguments
     queries = np.asarray(parts["local samples"].result.points_world)
     cloud, valid = np.asarray(cloud), np.asarray(valid)
     grid, change = parts["distance"].arguments
-    small, large, fits = place_windows(config, change, config.horizon_voxels * config.voxel_size)
-    searched = small if fits else large
-    features, doubtful = _sites(config, grid, searched)
+    searched = _searched(config, change, config.horizon_voxels)
+    seen_in = _searched(config, change, config.frontier_voxels)
+    window, _, beams = parts["rays"].arguments
+    free = np.asarray(beams.free_ranges)[np.asarray(beams.in_range)] / config.voxel_size
     work = {
-        "training": limits.training_work(config),
+        "calibration": limits.calibration_work(config, len(cloud), uncertainty._RETURNS),
+        **limits.evidence_work(window.passes.size, len(cloud), float(free.sum())),
         "distance": limits.distance_work(config, searched),
+        "frontier": limits.frontier_work(config, seen_in),
+        "grid samples": limits.grid_samples_work(config),
         "local samples": limits.nearest_work(len(queries), len(cloud)),
+        "training": limits.training_work(config),
     }
-    compare = {"training": "training", "local samples": "nearest", "distance": "distance"}
+    compare = {
+        "distance": "distance",
+        "frontier": "frontier",
+        "local samples": "nearest",
+        "training": "training",
+    }
     rows = []
     for name, part in tqdm(parts.items(), desc=label, leave=False):
         spread = time_ms(part.function, *part.arguments, seconds=seconds)
-        rows.append(_row(bench, f"{name}, {label}", spread, work.get(name), compare.get(name, "")))
+        rows.append(_row(bench, f"{name}, {label}", spread, work[name], compare.get(name, "")))
     bench.baselines["nearest"] = baselines.nearest(queries, cloud[valid], seconds)
+    features, doubtful = _sites(config, grid, searched)
     bench.baselines["distance"] = baselines.distance(features, doubtful, seconds)
+    bench.baselines["frontier"] = baselines.frontier(_seen(grid, seen_in), seconds)
     return rows
 
 
@@ -405,12 +417,19 @@ def _cloud_size_updates(bench: Bench) -> dict[str, Callable[[], MapState]]:
 
 
 def cloud_size_rows(bench: Bench) -> list[Row]:
-    """Updates by clouds of several sizes: drawn or padded to one size, and all of them used."""
+    """Updates by clouds of several sizes: drawn or padded to one size, and all of them used.
+
+    The first, of the smallest cloud, is the baseline.
+    """
     rows, updates = [], _cloud_size_updates(bench)
+    first = next(iter(updates))
     for name, update in tqdm(updates.items(), desc="cloud sizes", leave=False):
         if bench.out_of_time():
             return [*rows, Row(name, note=OUT_OF_TIME)]
-        rows.append(Row(name, "ms", time_ms(update, seconds=bench.sizes.seconds)))
+        spread = time_ms(update, seconds=bench.sizes.seconds)
+        if name == first:
+            bench.baselines["cloud size"] = [Baseline(name.removeprefix("update, light, "), spread)]
+        rows.append(Row(name, "ms", spread, "" if name == first else "cloud size"))
     return rows
 
 
@@ -538,6 +557,21 @@ def _sites(config: hio.Config, grid: Any, window: Window) -> tuple[np.ndarray, n
     axes = geometry.read_window(grid.surface.axes, start, shape)
     features = surface.is_feature(config, hits, passes, axes)
     return np.asarray(features), np.asarray(surface.is_doubtful(hits, passes))
+
+
+def _seen(grid: Any, window: Window) -> np.ndarray:
+    """The voxels of a window that a ray has reached."""
+    passes, hits = (
+        geometry.read_window(array, window.start, window.shape)
+        for array in (grid.passes, grid.hits)
+    )
+    return np.asarray(lookup.observed(passes, hits))
+
+
+def _searched(config: hio.Config, change: Change, horizon_voxels: int) -> Window:
+    """The window in which a change makes a stage compute its distances again."""
+    small, large, fits = place_windows(config, change, horizon_voxels * config.voxel_size)
+    return small if fits else large
 
 
 def _row(bench: Bench, name: str, spread: Spread, work: limits.Work | None, compare: str) -> Row:
