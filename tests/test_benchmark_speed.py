@@ -120,6 +120,7 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         "live arrays before",
     }
 
+    assert found["update, light, donated"]["compare"] == "not donated"
     ((state, cloud, pose, parts),) = taken_apart
     assert_stages_make_the_update(parts, state, hio.update(state, cloud, pose))
 
@@ -152,15 +153,23 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
     """With an update that does nothing: what it is given is what the rows are about."""
     given = []
 
-    def update(state, cloud, pose):
-        given.append((state.config, len(cloud)))
+    def update(state, cloud, pose, donate=False):
+        given.append((state.config, len(cloud), donate))
         return state
+
+    def compilations():
+        return {(config.grid_shape, config.max_points, donate) for config, _, donate in given}
 
     monkeypatch.setattr(tasks.hio, "update", update)
     extent = datasets.Extent(BOUNDS, CONFIG.max_range)
     bench = tasks.Bench(TINY, tmp_path, [room_cloud(0)], extent, deadline=math.inf)
     assert tasks.compile_sizes(bench) == []
-    compiled = {(config.grid_shape, config.max_points) for config, _ in given}
+    compiled = compilations()
+    given.clear()
+    (row,) = tasks.donated_rows(bench)
+    assert row.name == "update, light, donated" and row.spread.count == TINY.frames
+    assert all(donate for *_, donate in given)
+    whole = compilations()
     given.clear()
     found = tasks.cloud_size_rows(bench)
     assert [row.name for row in found] == [
@@ -169,7 +178,7 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
         "update, light, 500 points, 300 used",
         "update, light, 500 points, all used",
     ]
-    assert {(config.max_points, count) for config, count in given} == {
+    assert {(config.max_points, count) for config, count, _ in given} == {
         (300, 200),
         (200, 200),
         (300, 500),
@@ -178,14 +187,14 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
     assert [row.compare for row in found] == ["", *["cloud size"] * 3]
     (baseline,) = bench.baselines["cloud size"]
     assert baseline == rows.Baseline("200 points, 300 used", found[0].spread)
-    whole = {(config.grid_shape, config.max_points) for config, _ in given}
+    whole |= compilations()
     given.clear()
     found = tasks.map_size_rows(bench)
     assert [row.note for row in found] == ["20x20x16 voxels", "40x40x16 voxels"]
     assert [row.compare for row in found] == ["", "map size"]
     assert bench.baselines["map size"][0].spread == found[0].spread
-    assert {config.grid_shape for config, _ in given} == {(20, 20, 16), (40, 40, 16)}
-    assert compiled == whole | {(config.grid_shape, config.max_points) for config, _ in given}
+    assert {config.grid_shape for config, *_ in given} == {(20, 20, 16), (40, 40, 16)}
+    assert compiled == whole | compilations()
 
 
 def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):

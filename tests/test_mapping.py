@@ -1,6 +1,7 @@
 """The contract of the whole map: purity, transformations, bad input, growth, persistence."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -382,9 +383,31 @@ def test_an_empty_cloud_inside_jit_is_flagged(mapped):
 
 def test_a_fresh_state_can_be_donated():
     state = hio.init(CONFIG, jax.random.key(5))
-    cloud, pose = stream(1)[0]
-    after = jax.jit(hio.update, donate_argnums=0)(state, jnp.asarray(cloud), jnp.asarray(pose))
+    after = hio.update(state, *stream(1)[0], donate=True)
     assert int(after.updates) == 1
+
+
+def test_donated_maps_are_those_of_kept_ones(mapped, tmp_path):
+    path = tmp_path / "map.npz"
+    hio.save(path, mapped)
+    donated, kept = hio.load(path), mapped
+    for cloud, pose in stream(3):
+        before, donated = donated, hio.update(donated, cloud, pose, donate=True)
+        kept = hio.update(kept, cloud, pose)
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before))
+    assert arrays_equal(donated, kept)
+    assert int(donated.updates) == int(mapped.updates) + 3
+
+    with pytest.raises(ValueError, match="rigid"):
+        hio.update(donated, cloud, 2 * np.eye(4), donate=True)
+    again = hio.update(donated, cloud, pose, donate=True)
+    assert arrays_equal(again, hio.update(kept, cloud, pose))
+
+
+def test_donating_has_no_effect_inside_jit(empty):
+    arguments = (empty, *(jnp.asarray(array) for array in stream(1)[0]))
+    donating = jax.make_jaxpr(functools.partial(hio.update, donate=True))(*arguments)
+    assert str(donating) == str(jax.make_jaxpr(hio.update)(*arguments))
 
 
 def test_far_returns_are_averaged_like_near_ones():

@@ -54,6 +54,7 @@ class Sizes:
 
     Attributes:
         configs: Labels of `CONFIGS`; of the last, the stages are taken apart.
+        donated: The one of them whose map's memory is donated once more.
         overrides: Fields that are changed in all configurations.
         paper_overrides: Fields that are changed in the paper's training beside PyTorch's.
         frames: Updates that are timed after those that warm up.
@@ -71,6 +72,7 @@ class Sizes:
     """
 
     configs: tuple[str, ...]
+    donated: str
     overrides: dict[str, Any]
     paper_overrides: dict[str, Any]
     frames: int
@@ -89,6 +91,7 @@ class Sizes:
 
 FULL = Sizes(
     configs=tuple(CONFIGS),
+    donated="paper, slopes of 1 in 2",
     overrides={},
     paper_overrides={},
     frames=345,
@@ -107,6 +110,7 @@ FULL = Sizes(
 
 QUICK = Sizes(
     configs=("light",),
+    donated="light",
     overrides={},
     paper_overrides={"epochs": 1},
     frames=10,
@@ -190,6 +194,7 @@ def plan(bench: Bench) -> Iterator[tuple[str, Task]]:
     yield "network queries", lambda: network_query_rows(bench)
     yield "queries", lambda: query_rows(bench, "default" if "default" in configs else apart)
     yield "compiling by sizes", lambda: compile_sizes(bench)
+    yield "donated updates", lambda: donated_rows(bench)
     yield "cloud sizes", lambda: cloud_size_rows(bench)
     yield "map sizes", lambda: map_size_rows(bench)
     yield "endurance", lambda: endurance_rows(bench)
@@ -241,6 +246,8 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
     config = bench.config(label)
     state, times_ms, compile_s = _map_frames(bench, config, bench.sizes.frames)
     bench.states[label] = state
+    if label == bench.sizes.donated:
+        bench.baselines["not donated"] = [Baseline("the map before it kept", spread_of(times_ms))]
     cloud, pose = bench.frame(len(times_ms) + config.warmup_updates)
     prepared = jax.device_put(intake.prepare(cloud, pose, config.max_points))
     alone = time_ms(mapping._update_jit, state, *prepared, seconds=bench.sizes.seconds)
@@ -387,15 +394,28 @@ def query_rows(bench: Bench, label: str) -> list[Row]:
 
 
 def compile_sizes(bench: Bench) -> list[Row]:
-    """Compiles the updates of the next two tasks, at once on as many cores as there are."""
-    first = [
-        functools.partial(hio.update, hio.init(config, jax.random.key(0)), *bench.frame(0))
-        for config in _map_size_configs(bench).values()
-    ]
+    """Compiles the updates of the next three tasks, at once on as many cores as there are."""
+
+    def first(config: hio.Config, **how: Any) -> Callable[[], MapState]:
+        state = hio.init(config, jax.random.key(0))
+        return functools.partial(hio.update, state, *bench.frame(0), **how)
+
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        calls = [*_cloud_size_updates(bench).values(), *first]
+        calls = [
+            first(bench.config(bench.sizes.donated), donate=True),
+            *_cloud_size_updates(bench).values(),
+            *map(first, _map_size_configs(bench).values()),
+        ]
         jax.block_until_ready(list(pool.map(lambda call: call(), calls)))
     return []
+
+
+def donated_rows(bench: Bench) -> list[Row]:
+    """Whole updates over the stream that take over the memory of the map before."""
+    label = bench.sizes.donated
+    frames = bench.sizes.frames
+    _, times_ms, _ = _map_frames(bench, bench.config(label), frames, donate=True)
+    return [Row(f"update, {label}, donated", "ms", spread_of(times_ms), "not donated")]
 
 
 def _cloud_size_updates(bench: Bench) -> dict[str, Callable[[], MapState]]:
@@ -511,7 +531,7 @@ def endurance_rows(bench: Bench) -> list[Row]:
 
 
 def _map_frames(
-    bench: Bench, config: hio.Config, count: int
+    bench: Bench, config: hio.Config, count: int, **how: Any
 ) -> tuple[MapState, list[float], float]:
     """Maps the warm-up and `count` frames: the map, ms of each of these, s of compilation."""
     state = jax.block_until_ready(hio.init(config, jax.random.key(0)))
@@ -519,7 +539,7 @@ def _map_frames(
     for k in tqdm(range(warmup + count), desc="mapping", unit="frame", leave=False):
         cloud, pose = bench.frame(k)
         start = time.perf_counter()
-        state = jax.block_until_ready(hio.update(state, cloud, pose))
+        state = jax.block_until_ready(hio.update(state, cloud, pose, **how))
         times_ms.append(1e3 * (time.perf_counter() - start))
     return state, times_ms[warmup:], 1e-3 * (times_ms[0] - times_ms[1])
 
