@@ -76,7 +76,7 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
         state: The map so far.
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
         pose: (4, 4) T_world_sensor, rigid.
-        donate: Give the memory of `state` to the new map, which a GPU then has 1.5 ms sooner. The
+        donate: Give the memory of `state` to the new map, which is ready sooner then on a GPU. The
             old map cannot be used any more, except where this raises; a `snapshot` of it can.
             Inside jit it has no effect: donate the arguments of that function instead.
 
