@@ -30,7 +30,8 @@ class BackgroundMapper:
         """Starts the thread.
 
         Args:
-            state: The map so far, from `init`, `load` or another mapper.
+            state: The map so far, from `init`, `load` or another mapper; not to be donated
+                afterwards.
         """
         self.field: Field = field_of(state)
         self.dropped = 0

@@ -77,8 +77,10 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
         pose: (4, 4) T_world_sensor, rigid.
         donate: Give the memory of `state` to the new map, which is ready sooner then on a GPU. The
-            old map cannot be used any more, except where this raises; a `snapshot` of it can.
-            Inside jit it has no effect: donate the arguments of that function instead.
+            old map cannot be used any more, nor what shares arrays with it: its `report`, a
+            `BackgroundMapper` that began with it. What `snapshot`, `bake` and `grow` made of it
+            can, and it stays as it was where this raises a ValueError. Inside jit it has no
+            effect: donate the arguments of that function instead.
 
     Returns:
         The new map.
@@ -119,7 +121,8 @@ def grow(state: MapState, bounds: Any) -> MapState:
         bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; contains the old bounds.
 
     Returns:
-        The map in the new box. Inside the old one it answers bit by bit as before.
+        The map in the new box, which shares no memory with the old one. Inside the old box it
+        answers bit by bit as before.
 
     Raises:
         ValueError: The new bounds do not contain the old ones.
@@ -136,7 +139,8 @@ def grow(state: MapState, bounds: Any) -> MapState:
     grid = jax.tree.map(
         lambda empty, known: empty.at[place].set(known), evidence.empty_grid(new), state.grid
     )
-    return state.replace(config=new, grid=grid)
+    rest = jax.tree.map(jnp.copy, state.replace(grid=None))  # either map can be donated
+    return rest.replace(config=new, grid=grid)
 
 
 def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:

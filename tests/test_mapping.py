@@ -256,6 +256,11 @@ def test_grow_keeps_every_value(mapped):
     points = np.random.default_rng(3).uniform(*BOUNDS, (400, 3)).astype(np.float32)
     assert arrays_equal(hio.query(grown, points), hio.query(mapped, points))
     assert grown.config.grid_shape == (33, 40, 23)
+    # The two share no memory: either can be donated.
+    donated = hio.update(mapped, *stream(1)[0])
+    beside = hio.grow(donated, larger)
+    hio.update(donated, *stream(1)[0], donate=True)
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(beside))
     # Mapping goes on in the new part.
     pose = np.eye(4)
     pose[:3, 3] = [0, 2.0, 0]
@@ -391,12 +396,14 @@ def test_donated_maps_are_those_of_kept_ones(mapped, tmp_path):
     path = tmp_path / "map.npz"
     hio.save(path, mapped)
     donated, kept = hio.load(path), mapped
+    baked = hio.bake(donated, 0.2)
     for cloud, pose in stream(3):
         before, donated = donated, hio.update(donated, cloud, pose, donate=True)
         kept = hio.update(kept, cloud, pose)
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before))
     assert arrays_equal(donated, kept)
     assert int(donated.updates) == int(mapped.updates) + 3
+    assert arrays_equal(baked, hio.bake(mapped, 0.2))
 
     with pytest.raises(ValueError, match="rigid"):
         hio.update(donated, cloud, 2 * np.eye(4), donate=True)

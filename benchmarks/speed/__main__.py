@@ -51,10 +51,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, task in progress:
             progress.set_description(name)
             rows += _run(bench, name, task)
-            _write(options.output, options.stream.stem, bench, rows)  # if it is cut off
+            took_s = time.perf_counter() - began
+            _write(options.output, options.stream.stem, bench, rows, took_s)  # if it is cut off
     device = jax.devices()[0].device_kind
-    took = time.perf_counter() - began
-    print(f"{options.stream.stem}, {device}, {_host()}, jax {jax.__version__}, {took:.0f} s in all")
+    print(
+        f"{options.stream.stem}, {device}, {_host()}, jax {jax.__version__}, {took_s:.0f} s in all"
+    )
     print(format_table(rows, bench.baselines))
     print(f"wrote {options.output}")
     return 1 if any(row.failed for row in rows) else 0
@@ -73,12 +75,13 @@ def _run(bench: Bench, name: str, task: Task) -> list[Row]:
         return [Row(name, note=f"{type(error).__name__}: {reason}", failed=True)]
 
 
-def _write(path: Path, stream: str, bench: Bench, rows: list[Row]) -> None:
+def _write(path: Path, stream: str, bench: Bench, rows: list[Row], took_s: float) -> None:
     record = {
         "stream": stream,
         "device": jax.devices()[0].device_kind,
         "host": _host(),
         "jax": jax.__version__,
+        "took_s": took_s,
         "sizes": dataclasses.asdict(bench.sizes),
         "rows": [dataclasses.asdict(row) for row in rows],
         "baselines": {

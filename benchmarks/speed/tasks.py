@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import os
 import resource
 import subprocess
@@ -25,6 +26,7 @@ from benchmarks.speed import baselines, limits, stages
 from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
 from hiosdf_jax import datasets, intake, mapping, served, uncertainty
 from hiosdf_jax.grid import geometry, lookup, surface
+from hiosdf_jax.grid.beams import Beams
 from hiosdf_jax.grid.change import Change, Window, place_windows
 from hiosdf_jax.network import training
 from hiosdf_jax.query import field_of
@@ -33,6 +35,8 @@ from hiosdf_jax.state import Field, MapState
 
 Frame = tuple[np.ndarray, np.ndarray]  # cloud (N, 3) m in the sensor's frame, T_world_sensor
 Task = Callable[[], list[Row]]
+
+_TURNS = 5
 
 OUT_OF_TIME = "not run: --minutes are over"
 
@@ -54,7 +58,7 @@ class Sizes:
 
     Attributes:
         configs: Labels of `CONFIGS`; of the last, the stages are taken apart.
-        donated: The one of them whose map's memory is donated once more.
+        donated: The one of them that is timed again with the map's memory donated.
         overrides: Fields that are changed in all configurations.
         paper_overrides: Fields that are changed in the paper's training beside PyTorch's.
         frames: Updates that are timed after those that warm up.
@@ -91,7 +95,7 @@ class Sizes:
 
 FULL = Sizes(
     configs=tuple(CONFIGS),
-    donated="paper, slopes of 1 in 2",
+    donated="paper",
     overrides={},
     paper_overrides={},
     frames=345,
@@ -246,8 +250,6 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
     config = bench.config(label)
     state, times_ms, compile_s = _map_frames(bench, config, bench.sizes.frames)
     bench.states[label] = state
-    if label == bench.sizes.donated:
-        bench.baselines["not donated"] = [Baseline("the map before it kept", spread_of(times_ms))]
     cloud, pose = bench.frame(len(times_ms) + config.warmup_updates)
     prepared = jax.device_put(intake.prepare(cloud, pose, config.max_points))
     alone = time_ms(mapping._update_jit, state, *prepared, seconds=bench.sizes.seconds)
@@ -294,10 +296,9 @@ def stage_rows(bench: Bench, label: str) -> list[Row]:
     searched = _searched(config, change, config.horizon_voxels)
     seen_in = _searched(config, change, config.frontier_voxels)
     window, _, beams = parts["rays"].arguments
-    free = np.asarray(beams.free_ranges)[np.asarray(beams.in_range)] / config.voxel_size
     work = {
         "calibration": limits.calibration_work(config, len(cloud), uncertainty._RETURNS),
-        **limits.evidence_work(window.passes.size, len(cloud), float(free.sum())),
+        **limits.evidence_work(window.passes.size, len(cloud), _steps(config, beams)),
         "distance": limits.distance_work(config, searched),
         "frontier": limits.frontier_work(config, seen_in),
         "grid samples": limits.grid_samples_work(config),
@@ -411,11 +412,21 @@ def compile_sizes(bench: Bench) -> list[Row]:
 
 
 def donated_rows(bench: Bench) -> list[Row]:
-    """Whole updates over the stream that take over the memory of the map before."""
+    """Whole updates that take over the memory of the map before, in turns with some that do not."""
     label = bench.sizes.donated
-    frames = bench.sizes.frames
-    _, times_ms, _ = _map_frames(bench, bench.config(label), frames, donate=True)
-    return [Row(f"update, {label}, donated", "ms", spread_of(times_ms), "not donated")]
+    config = bench.config(label)
+    warmup = max(config.warmup_updates, 1)
+    indices = range(warmup, warmup + bench.sizes.frames)
+    turns = [range(warmup), *np.array_split(indices, _TURNS)]
+    states = {donate: hio.init(config, jax.random.key(0)) for donate in (False, True)}
+    times_ms: dict[bool, list[float]] = {donate: [] for donate in states}
+    for turn, donate in itertools.product(tqdm(turns, desc="turns", leave=False), states):
+        for k in turn:
+            states[donate], took_ms = _timed_update(bench, states[donate], k, donate=donate)
+            times_ms[donate].append(took_ms)
+    kept, donated = (spread_of(times_ms[donate][warmup:]) for donate in states)
+    bench.baselines["not donated"] = [Baseline("in turns with it, not donated", kept)]
+    return [Row(f"update, {label}, donated", "ms", donated, "not donated")]
 
 
 def _cloud_size_updates(bench: Bench) -> dict[str, Callable[[], MapState]]:
@@ -501,10 +512,8 @@ def endurance_rows(bench: Bench) -> list[Row]:
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         for k in tqdm(range(count), desc="endurance", unit="update", leave=False):
-            cloud, pose = bench.frame(k)
-            start = time.perf_counter()
-            state = jax.block_until_ready(hio.update(state, cloud, pose))
-            times_ms.append(1e3 * (time.perf_counter() - start))
+            state, took_ms = _timed_update(bench, state, k)
+            times_ms.append(took_ms)
             if bench.out_of_time():
                 break
     finally:
@@ -531,17 +540,25 @@ def endurance_rows(bench: Bench) -> list[Row]:
 
 
 def _map_frames(
-    bench: Bench, config: hio.Config, count: int, **how: Any
+    bench: Bench, config: hio.Config, count: int
 ) -> tuple[MapState, list[float], float]:
     """Maps the warm-up and `count` frames: the map, ms of each of these, s of compilation."""
     state = jax.block_until_ready(hio.init(config, jax.random.key(0)))
     times_ms, warmup = [], max(config.warmup_updates, 1)
     for k in tqdm(range(warmup + count), desc="mapping", unit="frame", leave=False):
-        cloud, pose = bench.frame(k)
-        start = time.perf_counter()
-        state = jax.block_until_ready(hio.update(state, cloud, pose, **how))
-        times_ms.append(1e3 * (time.perf_counter() - start))
+        state, took_ms = _timed_update(bench, state, k)
+        times_ms.append(took_ms)
     return state, times_ms[warmup:], 1e-3 * (times_ms[0] - times_ms[1])
+
+
+def _timed_update(
+    bench: Bench, state: MapState, index: int, *, donate: bool = False
+) -> tuple[MapState, float]:
+    """The map with a frame of the stream, and the ms that it took."""
+    cloud, pose = bench.frame(index)
+    start = time.perf_counter()
+    state = jax.block_until_ready(hio.update(state, cloud, pose, donate=donate))
+    return state, 1e3 * (time.perf_counter() - start)
 
 
 def _trainer(config: hio.Config) -> Callable[..., Any]:
@@ -586,6 +603,12 @@ def _seen(grid: Any, window: Window) -> np.ndarray:
         for array in (grid.passes, grid.hits)
     )
     return np.asarray(lookup.observed(passes, hits))
+
+
+def _steps(config: hio.Config, beams: Beams) -> float:
+    """That are made along the rays; one that ends stops a voxel before and goes on for 3 behind."""
+    free = np.asarray(beams.free_ranges)[np.asarray(beams.in_range)] / config.voxel_size
+    return float(free.sum()) + 2 * int(np.sum(beams.in_range & beams.ends))
 
 
 def _searched(config: hio.Config, change: Change, horizon_voxels: int) -> Window:
