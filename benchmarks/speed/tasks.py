@@ -65,7 +65,7 @@ class Sizes:
         seconds: How long to repeat whatever is repeated.
         processes: How often the imports are timed.
         matrix_edge: Of the product that measures the machine.
-        copied: float32 numbers in the copy that measures it.
+        copied: float32 numbers in the copy that measures it, more than a cache holds.
         queries: Points a query asks for.
         baked_queries: The same, of the baked field alone.
         bake_resolution: m.
@@ -121,7 +121,7 @@ QUICK = Sizes(
     seconds=0.3,
     processes=2,
     matrix_edge=1024,
-    copied=1 << 24,
+    copied=1 << 26,
     queries=102_400,
     baked_queries=102_400,
     bake_resolution=0.2,
