@@ -76,11 +76,11 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
         state: The map so far.
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
         pose: (4, 4) T_world_sensor, rigid.
-        donate: Give the memory of `state` to the new map, which is ready sooner then on a GPU. The
-            old map cannot be used any more, nor what shares arrays with it: its `report`, a
-            `BackgroundMapper` that began with it. What `snapshot`, `bake` and `grow` made of it
-            can, and it stays as it was where this raises a ValueError. Inside jit it has no
-            effect: donate the arguments of that function instead.
+        donate: Give the memory of `state` to the new map, which is ready sooner then on a GPU, but
+            not on a CPU. Afterwards neither the old map can be used nor what shares arrays with it:
+            its `report`, or a `BackgroundMapper` that began with it. What `snapshot`, `bake` and
+            `grow` made of it stays valid. If this raises a ValueError, nothing has been donated.
+            Inside jit it has no effect: donate the arguments of that function instead.
 
     Returns:
         The new map.

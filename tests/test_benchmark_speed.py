@@ -214,7 +214,7 @@ def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkey
     assert command.main([*arguments, "--only", "oun", "nothing"]) == 0
     record = json.loads((tmp_path / "speed.json").read_text("utf-8"))
     assert [row["name"] for row in record["rows"]] == ["sound"]
-    assert 0 < record["took_s"] < 60
+    assert record["took_s"] > 0
     assert record["host"].endswith(f"{os.cpu_count()} cores")
     with pytest.raises(SystemExit):
         command.main([*arguments, "--only", "nothing"])
@@ -302,15 +302,23 @@ def test_the_evidence_s_work_is_the_size_of_its_arrays():
     needed = (beams.directions_world, beams.free_ranges, beams.in_range, beams.ends)
     read = sum(array.nbytes for array in needed)
     assert work["rays"].memory == 2 * size(window, *traced) + read
-    each = size(state.grid, *traced, "hits", "sdf") / window.hits.size + 1
-    found = 9.0 * window.hits.size
-    assert each * window.hits.size == found
+
+    def a_voxel(*names):
+        return size(state.grid, *names) / state.grid.hits.size
+
+    # One of nearest's three numbers, two of the three axes; a sample is written with its weight.
+    whole = size(state.grid, *traced, "hits", "sdf", "nearest") - 2 * state.grid.hits.size
+    asked = 8 * a_voxel("nearest", "sdf") + a_voxel("mean") + 2 / 3 * a_voxel("axes") + 5 * 4
     samples = CONFIG.near_samples + CONFIG.far_samples
-    assert limits.grid_samples_work(CONFIG).memory == found + 78 * samples
+    drawn = limits.grid_samples_work(CONFIG)
+    assert drawn.memory == pytest.approx(whole + asked * samples)
+    asked = 8 * a_voxel("nearest", "sdf", "doubt", "frontier") + a_voxel("mean", "axes") + 3 * 4
+    network = limits._network_work(CONFIG, 50, 1).memory
+    assert limits.calibration_work(CONFIG, 300, 50).memory == network + 300 + 50 * asked
 
 
 def test_steps_are_those_of_the_rays():
-    """Counted by the grid that they are added to: two rays that end, one that does not."""
+    """They are counted by the grid that they are added to: two rays that end, one that does not."""
     cloud = jnp.asarray([[0.55, 0, 0], [0, 0.45, 0], [0, 0, 5.0]])
     config = dataclasses.replace(CONFIG, max_range=0.6)
     beams = place_cloud(config, cloud, jnp.ones(3, bool), jnp.eye(4))
@@ -318,7 +326,7 @@ def test_steps_are_those_of_the_rays():
     start, window = evidence.read_evidence(config, evidence.empty_grid(config), beams.sensor_world)
     traced = rays.trace_rays(config, window, start, beams)
     counted = float(traced.passes.sum() + traced.behind.sum())
-    assert abs(tasks._steps(config, beams) - counted) <= 3  # of each ray less than a step
+    assert abs(tasks._steps(config, beams) - counted) < 1
 
 
 def test_a_row_stands_beside_its_baselines():

@@ -25,7 +25,7 @@ class Limits(NamedTuple):
     Attributes:
         matrix: Operations a second in a large matrix product, in the type that the network uses.
         vector: float32 operations a second outside matrix products.
-        memory: Bytes a second that a large copy reads and writes.
+        memory: Bytes a second that are read and written where a large array is changed in place.
     """
 
     matrix: float
@@ -57,7 +57,7 @@ def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, li
 
     Args:
         matrix_edge: Rows and columns of the matrices.
-        elements: float32 numbers in the arrays that are copied and computed with; so many that an
+        elements: float32 numbers in the arrays that are changed and computed with; so many that an
             accelerator takes longer for them than to be called.
         seconds: How long to time each.
 
@@ -72,11 +72,11 @@ def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, li
     in_place = jax.jit(lambda x: x + 1, donate_argnums=0)
     held = [numbers + 1]
 
-    def copy() -> jax.Array:  # into memory that the process has: a new page costs a CPU more
+    def change() -> jax.Array:  # a new page would cost a CPU more than what is written to it
         held[0] = in_place(held[0])
         return held[0]
 
-    copied = time_ms(copy, seconds=seconds)
+    changed = time_ms(change, seconds=seconds)
 
     def chains(x: jax.Array, factor: jax.Array) -> jax.Array:
         several = [x + k for k in range(_CHAINS)]
@@ -88,13 +88,13 @@ def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, li
     limits = Limits(
         matrix=2.0 * matrix_edge**3 / (1e-3 * product.median),
         vector=2.0 * _STEPS * _CHAINS * elements / (1e-3 * chained.median),
-        memory=2.0 * numbers.nbytes / (1e-3 * copied.median),
+        memory=2.0 * numbers.nbytes / (1e-3 * changed.median),
     )
 
     rows = [
         (f"limit: {dtype} matrix product", "TFLOP/s", 1e-12 * limits.matrix),
         ("limit: float32 multiply-adds", "TFLOP/s", 1e-12 * limits.vector),
-        ("limit: copy, read + write", "GB/s", 1e-9 * limits.memory),
+        ("limit: memory, read + write", "GB/s", 1e-9 * limits.memory),
     ]
     return limits, [Row(name, unit, single(value)) for name, unit, value in rows]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import os
 import resource
 import subprocess
@@ -57,8 +56,7 @@ class Sizes:
     """How much is measured.
 
     Attributes:
-        configs: Labels of `CONFIGS`; of the last, the stages are taken apart.
-        donated: The one of them that is timed again with the map's memory donated.
+        configs: Labels of `CONFIGS`; of the last, the stages are taken apart and maps donated.
         overrides: Fields that are changed in all configurations.
         paper_overrides: Fields that are changed in the paper's training beside PyTorch's.
         frames: Updates that are timed after those that warm up.
@@ -76,7 +74,6 @@ class Sizes:
     """
 
     configs: tuple[str, ...]
-    donated: str
     overrides: dict[str, Any]
     paper_overrides: dict[str, Any]
     frames: int
@@ -95,7 +92,6 @@ class Sizes:
 
 FULL = Sizes(
     configs=tuple(CONFIGS),
-    donated="paper",
     overrides={},
     paper_overrides={},
     frames=345,
@@ -114,7 +110,6 @@ FULL = Sizes(
 
 QUICK = Sizes(
     configs=("light",),
-    donated="light",
     overrides={},
     paper_overrides={"epochs": 1},
     frames=10,
@@ -376,7 +371,8 @@ def query_rows(bench: Bench, label: str) -> list[Row]:
 
     def add(name: str, count: int, spread: Spread, work: limits.Work | None = None) -> None:
         full = f"sdf and gradient of {count:,}, {name}, {label}"
-        rows.append(_row(bench, full, spread, work, "network query"))
+        compare = "network query" if count == sizes.queries else ""  # as many as PyTorch's
+        rows.append(_row(bench, full, spread, work, compare))
 
     work = limits.network_query_work(config, sizes.queries)
     add("network", sizes.queries, time_ms(_network, field, points, seconds=seconds), work)
@@ -386,11 +382,9 @@ def query_rows(bench: Bench, label: str) -> list[Row]:
     baking = time_ms(bake, field, seconds=seconds)
     baked = bake(field)
     samples = f"{baked.sdf.size:,} samples of {sizes.bake_resolution} m"
-    for count in (sizes.queries, sizes.baked_queries):
+    for count in dict.fromkeys((sizes.queries, sizes.baked_queries)):
         spread = time_ms(hio.sdf_and_grad, baked, _points_in(config, count), seconds=seconds)
         add("baked", count, spread, limits.baked_work(count))
-    # PyTorch's queries are of another number of points.
-    rows[-1] = dataclasses.replace(rows[-1], compare="")
     return [*rows, Row(f"bake, {label}", "ms", baking, note=samples)]
 
 
@@ -403,7 +397,7 @@ def compile_sizes(bench: Bench) -> list[Row]:
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         calls = [
-            first(bench.config(bench.sizes.donated), donate=True),
+            first(bench.config(bench.sizes.configs[-1]), donate=True),
             *_cloud_size_updates(bench).values(),
             *map(first, _map_size_configs(bench).values()),
         ]
@@ -413,17 +407,18 @@ def compile_sizes(bench: Bench) -> list[Row]:
 
 def donated_rows(bench: Bench) -> list[Row]:
     """Whole updates that take over the memory of the map before, in turns with some that do not."""
-    label = bench.sizes.donated
+    label = bench.sizes.configs[-1]
     config = bench.config(label)
     warmup = max(config.warmup_updates, 1)
     indices = range(warmup, warmup + bench.sizes.frames)
     turns = [range(warmup), *np.array_split(indices, _TURNS)]
     states = {donate: hio.init(config, jax.random.key(0)) for donate in (False, True)}
     times_ms: dict[bool, list[float]] = {donate: [] for donate in states}
-    for turn, donate in itertools.product(tqdm(turns, desc="turns", leave=False), states):
-        for k in turn:
-            states[donate], took_ms = _timed_update(bench, states[donate], k, donate=donate)
-            times_ms[donate].append(took_ms)
+    for turn in tqdm(turns, desc="turns", leave=False):
+        for donate in states:
+            for k in turn:
+                states[donate], took_ms = _timed_update(bench, states[donate], k, donate=donate)
+                times_ms[donate].append(took_ms)
     kept, donated = (spread_of(times_ms[donate][warmup:]) for donate in states)
     bench.baselines["not donated"] = [Baseline("in turns with it, not donated", kept)]
     return [Row(f"update, {label}, donated", "ms", donated, "not donated")]
