@@ -64,29 +64,23 @@ def nearest(queries: np.ndarray, points: np.ndarray, seconds: float) -> list[Bas
 
 def distance(features: np.ndarray, doubtful: np.ndarray, seconds: float) -> list[Baseline]:
     """Nearest feature voxels, and distances to doubtful ones, of the same window."""
-
-    def measure(ndimage: Any) -> Spread:
-        def transforms() -> Any:
-            return (
-                ndimage.distance_transform_edt(~features, return_indices=True),
-                ndimage.distance_transform_edt(~doubtful),
-            )
-
-        return time_ms(transforms, seconds=seconds)
-
-    return _by_scipy("scipy distance_transform_edt on the CPU, twice", "ndimage", measure)
+    return _by_transforms(
+        "twice", lambda edt: (edt(~features, return_indices=True), edt(~doubtful)), seconds
+    )
 
 
 def frontier(seen: np.ndarray, seconds: float) -> list[Baseline]:
     """Distances from seen voxels to unseen ones and back, of the same window."""
+    return _by_transforms("both ways", lambda edt: (edt(seen), edt(~seen)), seconds)
+
+
+def _by_transforms(how: str, transforms: Callable[[Any], Any], seconds: float) -> list[Baseline]:
+    """Measures what is given scipy's exact distance transform."""
 
     def measure(ndimage: Any) -> Spread:
-        def transforms() -> Any:
-            return ndimage.distance_transform_edt(seen), ndimage.distance_transform_edt(~seen)
+        return time_ms(lambda: transforms(ndimage.distance_transform_edt), seconds=seconds)
 
-        return time_ms(transforms, seconds=seconds)
-
-    return _by_scipy("scipy distance_transform_edt on the CPU, both ways", "ndimage", measure)
+    return _by_scipy(f"scipy distance_transform_edt on the CPU, {how}", "ndimage", measure)
 
 
 def _by_torch(label: str, measure: Callable[[Any, Any, str], Spread]) -> list[Baseline]:

@@ -63,7 +63,7 @@ class Sizes:
         seconds: How long to repeat whatever is repeated.
         processes: How often the imports are timed.
         matrix_edge: Of the product that measures the machine.
-        copied: float32 numbers in the copy that measures it, more than a cache holds.
+        elements: float32 numbers that are changed to measure it, more than a cache holds.
         queries: Points a query asks for.
         baked_queries: The same, of the baked field alone.
         bake_resolution: m.
@@ -80,7 +80,7 @@ class Sizes:
     seconds: float
     processes: int
     matrix_edge: int
-    copied: int
+    elements: int
     queries: int
     baked_queries: int
     bake_resolution: float
@@ -98,7 +98,7 @@ FULL = Sizes(
     seconds=1.0,
     processes=5,
     matrix_edge=8192,
-    copied=1 << 28,
+    elements=1 << 28,
     queries=102_400,
     baked_queries=1_048_576,
     bake_resolution=0.05,
@@ -116,7 +116,7 @@ QUICK = Sizes(
     seconds=0.3,
     processes=2,
     matrix_edge=1024,
-    copied=1 << 26,
+    elements=1 << 26,
     queries=102_400,
     baked_queries=102_400,
     bake_resolution=0.2,
@@ -276,7 +276,7 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
 def limit_rows(bench: Bench) -> list[Row]:
     """The machine's rates, for the shares of the rows that follow."""
     sizes = bench.sizes
-    bench.limits, rows = limits.measure(sizes.matrix_edge, sizes.copied, sizes.seconds)
+    bench.limits, rows = limits.measure(sizes.matrix_edge, sizes.elements, sizes.seconds)
     return rows
 
 
@@ -391,9 +391,9 @@ def query_rows(bench: Bench, label: str) -> list[Row]:
 def compile_sizes(bench: Bench) -> list[Row]:
     """Compiles the updates of the next three tasks, at once on as many cores as there are."""
 
-    def first(config: hio.Config, **how: Any) -> Callable[[], MapState]:
+    def first(config: hio.Config, donate: bool = False) -> Callable[[], MapState]:
         state = hio.init(config, jax.random.key(0))
-        return functools.partial(hio.update, state, *bench.frame(0), **how)
+        return functools.partial(hio.update, state, *bench.frame(0), donate=donate)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         calls = [
