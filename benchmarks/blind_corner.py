@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hiosdf_jax as hio
-from hiosdf_jax.demo import navigate
+from hiosdf_jax._src.demo import navigate
 
 HEIGHT = 0.6  # m, of the corridor
 SENSOR_HEIGHT = 0.3  # m, of the robot's centre too

@@ -22,7 +22,7 @@ import numpy as np
 def run(seed: int, folder: Path) -> dict:
     """Runs `hiosdf demo --plan` once."""
     begin = time.perf_counter()
-    command = [sys.executable, "-m", "hiosdf_jax.cli", "demo", "--plan", "--seed", str(seed)]
+    command = [sys.executable, "-m", "hiosdf_jax", "demo", "--plan", "--seed", str(seed)]
     done = subprocess.run([*command, "--output", str(folder)], capture_output=True, text=True)
     seconds = time.perf_counter() - begin
     if done.returncode not in (0, 1):

@@ -24,7 +24,8 @@ import numpy as np
 from tqdm import tqdm
 
 import hiosdf_jax as hio
-from hiosdf_jax import datasets, demo, planning, served
+from hiosdf_jax import datasets, demo, planning
+from hiosdf_jax._src.field import blend
 
 RADIUS = 0.1  # m
 MOTION = 0.05  # m, the length of a swept motion
@@ -50,7 +51,7 @@ def network_clearance_and_grad(
     field: hio.Field, centers_world: jax.Array, radii: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The same as `sphere_clearance_and_grad`, by the network alone."""
-    value, gradient = served.network_sdf_and_grad(field, centers_world)
+    value, gradient = blend.network_sdf_and_grad(field, centers_world)
     return value - radii, gradient
 
 

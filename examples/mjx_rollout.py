@@ -11,7 +11,7 @@ from mujoco import mjx
 from scene import build_map, exact_sdf
 
 import hiosdf_jax as hio
-from hiosdf_jax.planning.mjx_rollout import rollout, sphere_geoms
+from hiosdf_jax._src.planning.adapters.mjx import rollout, sphere_geoms
 
 HORIZON, HOLD = 16, 5  # controls, of 5 steps of 0.02 s
 MARGIN = 0.08  # m

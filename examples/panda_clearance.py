@@ -9,7 +9,7 @@ import numpy as np
 from scene import build_map, exact_sdf
 
 import hiosdf_jax as hio
-from hiosdf_jax.planning.frax_arm import arm_clearance_and_grad, arm_spheres
+from hiosdf_jax._src.planning.adapters.frax import arm_clearance_and_grad, arm_spheres
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # frax's advice on how to set up a CPU

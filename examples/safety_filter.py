@@ -11,7 +11,7 @@ import hiosdf_jax as hio
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # cbfpy's advice on how to set up a CPU
-    from hiosdf_jax.planning.barrier import inscribed, velocity_filter
+    from hiosdf_jax._src.planning.adapters.cbf import inscribed, velocity_filter
 
 RADIUS, SPEED, DT = 0.15, 1.0, 0.05  # m, m/s along each axis, s
 # What it travels within DT, and 3 cm for the map's error.

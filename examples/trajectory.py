@@ -8,7 +8,7 @@ import numpy as np
 from scene import build_map, exact_sdf
 
 import hiosdf_jax as hio
-from hiosdf_jax.planning.trajectory import optimize_trajectory, waves
+from hiosdf_jax._src.planning.trajectory import optimize_trajectory, waves
 
 RADIUS = 0.15  # m, of a ball that shall pass
 QUERIES = (((2.4, 3.5, 0.6), (3.5, 2.4, 0.6)), ((0.4, 0.5, 0.8), (3.4, 2.2, 0.4)))  # m

@@ -1,14 +1,14 @@
 """Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463)."""
 
 from hiosdf_jax import planning
-from hiosdf_jax.background import BackgroundMapper
-from hiosdf_jax.bake import bake
-from hiosdf_jax.checkpoint import load, save
-from hiosdf_jax.config import Config
-from hiosdf_jax.mapping import grow, init, snapshot, update
-from hiosdf_jax.mesh import extract_mesh
-from hiosdf_jax.query import query, sdf, sdf_and_grad
-from hiosdf_jax.state import Baked, Field, Flag, MapState, Query, Report
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.field.baking import bake
+from hiosdf_jax._src.field.mesh import extract_mesh
+from hiosdf_jax._src.field.points import query, sdf, sdf_and_grad
+from hiosdf_jax._src.mapping.background import BackgroundMapper
+from hiosdf_jax._src.mapping.checkpoint import load, save
+from hiosdf_jax._src.mapping.pipeline import grow, init, snapshot, update
+from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 
 __all__ = [
     "BackgroundMapper",

@@ -9,7 +9,7 @@ import pytest
 from room import CONFIG, stream
 
 import hiosdf_jax as hio
-from hiosdf_jax import background
+from hiosdf_jax._src.mapping import background
 
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)).astype(np.float32)
 

@@ -9,7 +9,7 @@ import pytest
 from room import BOUNDS, CONFIG, HALF, map_of_room
 
 import hiosdf_jax as hio
-from hiosdf_jax import lattice
+from hiosdf_jax._src.field import lattice
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,10 @@ from matplotlib.image import imread
 import hiosdf_jax as hio
 from benchmarks.accuracy import __main__ as command
 from benchmarks.accuracy import figure, gate, measure, results
-from hiosdf_jax import datasets, evaluation, run
-from hiosdf_jax.grid.lookup import grid_sdf
+from hiosdf_jax import datasets
+from hiosdf_jax._src.command import run
+from hiosdf_jax._src.grid.lookup import grid_sdf
+from hiosdf_jax._src.scoring import metrics
 
 HALF = np.array([1.2, 1.0, 0.8])  # of a room around the origin
 FRAMES = 8
@@ -93,13 +95,13 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
 
     def score(state, frame, **settings):
         ask = functools.partial(answer, hio.snapshot(state))
-        return evaluation.evaluate(ask, truth, last_frame=frame, **settings)
+        return metrics.evaluate(ask, truth, last_frame=frame, **settings)
 
     record, real = json.loads(output.read_text())
     assert (record["stream"], record["seed"], record["frames"]) == ("room", 0, FRAMES)
     served = record["variants"]["served"]
     expected = score(state, FRAMES - 1, sensor_position_world=[0.5, 0, 0])
-    expected |= evaluation.evaluate_lower(
+    expected |= metrics.evaluate_lower(
         jax.jit(lambda points: hio.query(state, points).lower), truth, FRAMES - 1
     )
     expected["early_then_cm"] = score(states[3], 3)["visible_cm"]
@@ -355,7 +357,7 @@ def test_peers_have_the_published_figures():
     assert peers["house_depth"]["Voxfield 10 cm"]["visible_cm"] == [3.09]
     assert peers["house_lidar"]["HIO-SDF"]["recall"] == [0.793]
     metrics = {key for systems in peers.values() for row in systems.values() for key in row}
-    assert metrics <= evaluation.METRICS.keys()
+    assert metrics <= metrics.METRICS.keys()
 
 
 def test_figure(tmp_path):

@@ -17,11 +17,11 @@ import hiosdf_jax as hio
 from benchmarks.speed import __main__ as command
 from benchmarks.speed import baselines, limits, rows, stages, tasks
 from hiosdf_jax import datasets
-from hiosdf_jax.grid import distance, evidence, frontier, rays
-from hiosdf_jax.grid.beams import place_cloud
-from hiosdf_jax.grid.change import Window
-from hiosdf_jax.network import passes, siren, training
-from hiosdf_jax.samples import Samples
+from hiosdf_jax._src.grid import carving, distance, evidence, frontier
+from hiosdf_jax._src.grid.change import Window
+from hiosdf_jax._src.grid.rays import place_cloud
+from hiosdf_jax._src.network import forward, siren, training
+from hiosdf_jax._src.samples.draw import Samples
 
 # The same map as that of other tests, so that its update is compiled once for them all.
 TINY_CONFIG = {
@@ -240,7 +240,7 @@ def test_work_is_what_xla_counts():
     # The residuals at the end of an update's training are no part of the gradient.
     once = limits.training_work(config).matrix - limits.network_query_work(config, 600).matrix / 2
     assert once == pytest.approx(operations(gradient, network.params), rel=0.05)
-    asked = operations(lambda p: passes.value_and_gradient(10.0, p, points), network.params)
+    asked = operations(lambda p: forward.value_and_gradient(10.0, p, points), network.params)
     assert limits.network_query_work(config, 600).matrix == pytest.approx(asked, rel=0.1)
 
 
@@ -324,7 +324,7 @@ def test_steps_are_those_of_the_rays():
     beams = place_cloud(config, cloud, jnp.ones(3, bool), jnp.eye(4))
     assert beams.ends.tolist() == [True, True, False]
     start, window = evidence.read_evidence(config, evidence.empty_grid(config), beams.sensor_world)
-    traced = rays.trace_rays(config, window, start, beams)
+    traced = carving.trace_rays(config, window, start, beams)
     counted = float(traced.passes.sum() + traced.behind.sum())
     assert abs(tasks._steps(config, beams) - counted) < 1
 

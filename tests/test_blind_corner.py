@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
-from hiosdf_jax.demo import navigate
+from hiosdf_jax._src.demo import navigate
 
 FILE = Path(__file__).parents[1] / "benchmarks" / "blind_corner.py"
 

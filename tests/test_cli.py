@@ -11,7 +11,8 @@ import trimesh
 from matplotlib.image import imread
 
 import hiosdf_jax as hio
-from hiosdf_jax import cli, datasets, run
+from hiosdf_jax import datasets
+from hiosdf_jax._src.command import cli, run
 from hiosdf_jax.datasets import NpzStream
 
 # A room without furniture; the sensor walks round in it.
@@ -340,7 +341,7 @@ def test_bad_arguments(capsys, arguments):
 
 def test_help():
     result = subprocess.run(
-        [sys.executable, "-m", "hiosdf_jax.cli", "--help"],
+        [sys.executable, "-m", "hiosdf_jax", "--help"],
         capture_output=True,
         text=True,
         check=True,

@@ -6,7 +6,7 @@ import math
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax.config import _LIMITS
+from hiosdf_jax._src.config import _LIMITS
 
 BOUNDS = ((0, 0, 0), (2, 2, 2))
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hiosdf_jax.datasets.files import numbered_files, read_rows
-from hiosdf_jax.datasets.poses import check_pose
-from hiosdf_jax.datasets.trajectory import Trajectory, pose_at, read_trajectory
-from hiosdf_jax.datasets.transforms import Edge, path_up, transform_up
+from hiosdf_jax._src.datasets.files import numbered_files, read_rows
+from hiosdf_jax._src.datasets.poses import check_pose
+from hiosdf_jax._src.datasets.trajectory import Trajectory, pose_at, read_trajectory
+from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
 
 SEEDS = st.integers(0, 2**31)
 

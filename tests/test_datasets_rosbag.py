@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hiosdf_jax._src.datasets.rosbag import cloud_of
 from hiosdf_jax.datasets import BadFrameError, find_bounds, open_stream, read_frame
-from hiosdf_jax.datasets.rosbag import cloud_of
 
 rosbags = pytest.importorskip("rosbags")
-from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
-from rosbags.rosbag2 import StoragePlugin  # noqa: E402
-from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: E402
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 START = 1_700_000_000  # s
 CLOUDS = np.random.default_rng(0).uniform(-3, 3, (5, 20, 3)).astype(np.float32)

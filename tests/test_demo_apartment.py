@@ -6,7 +6,7 @@ from scipy.sparse.csgraph import connected_components
 
 mujoco = pytest.importorskip("mujoco")
 
-from hiosdf_jax.demo import (  # noqa: E402
+from hiosdf_jax.demo import (
     BOUNDS_WORLD,
     ApartmentStream,
     camera_path,
@@ -330,7 +330,7 @@ def test_thin_points_are_seen_and_on_thin_parts(clean, truth):
 
 
 def _distance_to(model, geom, points):
-    from hiosdf_jax.demo import primitives
+    from hiosdf_jax._src.demo import primitives
 
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

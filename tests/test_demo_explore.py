@@ -7,10 +7,11 @@ import pytest
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, label
 
-from hiosdf_jax import cli, demo
+from hiosdf_jax import demo
+from hiosdf_jax._src.command import cli
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
-from hiosdf_jax.demo import explore, navigate
+from hiosdf_jax._src.demo import exploration, navigate
 
 
 @pytest.fixture(scope="module")
@@ -21,18 +22,18 @@ def model():
 def test_the_exact_clearance_is_that_of_the_capsule(model):
     # Beside the column of the living room, of radius 0.15 m at (4.15, 2.1).
     xy = np.array([[3.7, 2.1], [4.6, 2.1], [4.15, 2.4]])
-    np.testing.assert_allclose(explore.exact_clearance(model, xy), [0.1, 0.1, -0.05], atol=1e-9)
+    np.testing.assert_allclose(exploration.exact_clearance(model, xy), [0.1, 0.1, -0.05], atol=1e-9)
     # Where nothing is near it is the height of its underside over the floor.
-    np.testing.assert_allclose(explore.exact_clearance(model, [[3.0, 3.5]]), [0.15], atol=1e-9)
+    np.testing.assert_allclose(exploration.exact_clearance(model, [[3.0, 3.5]]), [0.15], atol=1e-9)
 
 
 def test_problems_are_solvable_and_not_trivial(model):
-    plane = navigate.lay_plane(explore.BOUNDS_WORLD, 0.1)
-    gap = explore.exact_clearance(model, plane.centres().reshape(-1, 2)).reshape(plane.shape)
+    plane = navigate.lay_plane(exploration.BOUNDS_WORLD, 0.1)
+    gap = exploration.exact_clearance(model, plane.centres().reshape(-1, 2)).reshape(plane.shape)
     regions, _ = label(gap > 0.08)
     kinds = set()
     for seed in range(4):
-        problem = explore.draw_problem(model, seed)
+        problem = exploration.draw_problem(model, seed)
         start, goal = plane.cell(problem.start[:2]), plane.cell(problem.goal)
         assert regions[start] == regions[goal] != 0
         free = 0.1 * distance_transform_edt(gap > 0.08)
@@ -44,12 +45,12 @@ def test_problems_are_solvable_and_not_trivial(model):
         assert demo.signed_distance(model, points)[0].min() < 0.05
         kinds.add(problem.rooms)
     assert len(kinds) >= 3
-    np.testing.assert_array_equal(explore.draw_problem(model, 3).start, problem.start)
+    np.testing.assert_array_equal(exploration.draw_problem(model, 3).start, problem.start)
 
 
 def test_the_camera_looks_ahead_and_down_from_the_front_of_the_body():
     tilt = np.radians(25)
-    pose = explore.camera_pose(np.array([2.0, 3.0, np.pi / 2, 0, 0]), tilt)
+    pose = exploration.camera_pose(np.array([2.0, 3.0, np.pi / 2, 0, 0]), tilt)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
     np.testing.assert_allclose(pose[:3, 3], [2.0, 3.2, 1.1])
@@ -88,15 +89,15 @@ def steps_until(condition, watch, state):
     for count in range(1, 1000):
         vain = watch.looked_in_vain(state)
         if condition(watch):
-            return count * explore.ROBOT.step, vain
+            return count * exploration.ROBOT.step, vain
     raise AssertionError("never")
 
 
 def test_a_robot_that_is_stuck_looks_around_and_the_second_time_gives_up():
-    watch = explore._Watch(np.zeros(2))
+    watch = exploration._Watch(np.zeros(2))
     assert watch.turning
     turn = steps_until(lambda w: not w.turning, watch, still(0, 1.5))
-    assert turn == (pytest.approx(2 * np.pi / 1.5, abs=explore.ROBOT.step), False)
+    assert turn == (pytest.approx(2 * np.pi / 1.5, abs=exploration.ROBOT.step), False)
     for x in np.linspace(0, 2, 100):  # slow, but it gets on
         assert not watch.looked_in_vain(still(x)) and not watch.turning
     seconds, vain = steps_until(lambda w: w.turning, watch, still(2))
@@ -111,7 +112,7 @@ def test_the_way_that_is_given_up_is_what_was_not_seen_just_ahead():
     x = plane.centres()[..., 0]
     cells = navigate.Survey(gap=np.ones(plane.shape), seen=x < 1.0)
     path = np.column_stack([np.arange(0.55, 2.6, 0.07), np.full(30, 0.55)])
-    barred = explore._bar(plane, path, cells)
+    barred = exploration._bar(plane, path, cells)
     # From the first unseen cell, and one cell around, to a metre ahead.
     np.testing.assert_array_equal(barred[:, 5], (x[:, 0] > 0.9) & (x[:, 0] < 1.7))
     assert not barred[:, :4].any() and not barred[:, 7:].any()

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from hiosdf_jax.state import Baked
+from hiosdf_jax._src.state import Baked
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
-from hiosdf_jax.demo import navigate
+from hiosdf_jax._src.demo import navigate
 
 ROBOT = navigate.Robot(heights=(0.3, 0.5))
 BOUNDS = ((0.0, 0.0, 0.0), (4.0, 3.0, 1.0))

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 mujoco = pytest.importorskip("mujoco")
 
-from hiosdf_jax.demo import primitives  # noqa: E402
-from hiosdf_jax.demo.primitives import signed_distance  # noqa: E402
+from hiosdf_jax._src.demo import primitives
+from hiosdf_jax._src.demo.primitives import signed_distance
 
 POSITION = np.array([0.3, -0.2, 0.5])
 ROTATION = Rotation.from_euler("xyz", [40, -25, 70], degrees=True)

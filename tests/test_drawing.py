@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from hiosdf_jax import drawing
+from hiosdf_jax._src.view import drawing
 
 
 def test_slice_heights():

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from hiosdf_jax import evaluation
-from hiosdf_jax.evaluation import (
+from hiosdf_jax._src.scoring import metrics
+from hiosdf_jax._src.scoring.metrics import (
     GroundTruth,
     choose_thin,
     evaluate,
@@ -184,7 +184,7 @@ def test_table_of_bands():
     assert len(lines) == 6
 
 
-@pytest.mark.parametrize("count", [1, evaluation._CHUNK, evaluation._CHUNK + 1])
+@pytest.mark.parametrize("count", [1, metrics._CHUNK, metrics._CHUNK + 1])
 def test_a_jitted_map_compiles_once_and_keeps_the_order(count):
     traces = []
 
@@ -248,7 +248,7 @@ def test_misuse_is_named():
 
 
 def test_held_out_surface():
-    points = np.zeros((evaluation._CHUNK + 9, 3), np.float32)
+    points = np.zeros((metrics._CHUNK + 9, 3), np.float32)
     points[:, 0] = np.linspace(-0.2, 0.2, len(points))
     scores = held_out_surface(lambda p: p[:, 0], points)
     assert scores["median_cm"] == pytest.approx(10, rel=1e-3)

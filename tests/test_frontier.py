@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from room import BOUNDS, CONFIG, map_of_room
 
 import hiosdf_jax as hio
-from hiosdf_jax.grid import frontier, geometry, lookup
+from hiosdf_jax._src.grid import frontier, geometry, lookup
 
 signed_box_distance = jax.jit(frontier.signed_box_distance, static_argnums=1)
 

@@ -8,7 +8,7 @@ from analytic import equalities_with_least
 
 import hiosdf_jax as hio
 from hiosdf_jax import planning
-from hiosdf_jax.gradient import least, value_and_gradient
+from hiosdf_jax._src.numerics.gradient import least, value_and_gradient
 
 CONFIG = hio.Config.light(((-1.0, -2.0, 0.0), (3.0, 1.0, 2.0)), hidden_width=16, max_points=64)
 

@@ -12,22 +12,22 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 import hiosdf_jax as hio
-from hiosdf_jax.grid import (
+from hiosdf_jax._src.grid import (
+    carving,
     change,
     distance,
     evidence,
     frontier,
     geometry,
     lookup,
-    rays,
-    sampling,
-    surface,
-    vectors,
+    patches,
 )
-from hiosdf_jax.grid.beams import Beams, place_cloud
-from hiosdf_jax.grid.vectors import join, split
-from hiosdf_jax.rigid import is_rigid
-from hiosdf_jax.samples import draw_from_mask
+from hiosdf_jax._src.grid.rays import Beams, place_cloud
+from hiosdf_jax._src.numerics import vectors
+from hiosdf_jax._src.numerics.rigid import is_rigid
+from hiosdf_jax._src.numerics.vectors import join, split
+from hiosdf_jax._src.samples import from_grid
+from hiosdf_jax._src.samples.draw import draw_from_mask
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
 CONFIG = hio.Config.light(
@@ -37,8 +37,8 @@ SHAPE = (12, 10, 8)
 FIRST = jnp.zeros(3, jnp.int32)  # the window is the whole grid
 
 # One compilation a stage and configuration, as in an update.
-fuse_hits = jax.jit(surface.fuse_hits, static_argnums=0)
-trace_rays = jax.jit(rays.trace_rays, static_argnums=0)
+fuse_hits = jax.jit(patches.fuse_hits, static_argnums=0)
+trace_rays = jax.jit(carving.trace_rays, static_argnums=0)
 fade_evidence = jax.jit(evidence.fade_evidence, static_argnums=0)
 update_distances = jax.jit(distance.update_distances, static_argnums=0)
 update_frontier = jax.jit(frontier.update_frontier, static_argnums=0)
@@ -225,7 +225,7 @@ def test_the_order_of_rows_does_not_matter():
 def test_principal_axes_against_numpy(seed, rank):
     factor = np.random.default_rng(seed).normal(size=(3, rank))
     spread = (factor @ factor.T).astype(np.float32)
-    deviation, direction = surface.principal_axes(jnp.asarray(spread))
+    deviation, direction = patches.principal_axes(jnp.asarray(spread))
     expected = np.sqrt(np.maximum(np.linalg.eigvalsh(spread.astype(np.float64))[::-1], 0))
     scale = max(1.0, expected[0])
     np.testing.assert_allclose(np.square(deviation), np.square(expected), atol=2e-6 * scale**2)
@@ -268,7 +268,7 @@ def test_patch_offset_against_a_dense_rectangle(seed, half):
     point32, mean32, first, second = (
         split(jnp.asarray(x, jnp.float32)) for x in (point, mean, axes[0], axes[1])
     )
-    offset = surface.patch_offset(point32, mean32, (first, second))
+    offset = patches.patch_offset(point32, mean32, (first, second))
     np.testing.assert_allclose(np.linalg.norm(offset), nearest, atol=1e-4)
 
 
@@ -300,7 +300,7 @@ def test_rays_against_a_loop(hit):
     ends = uniform(7, 40, (-0.8, -0.4, 0.0), (1.4, 1.4, 1.2)).astype(np.float64)
     grid = trace(empty_grid(), ends, sensor, hit)
     passes, behind = np.zeros(SHAPE), np.zeros(SHAPE)
-    phases = np.asarray(rays._phases(40), np.float64)
+    phases = np.asarray(carving._phases(40), np.float64)
     for end, phase in zip(ends, phases, strict=True):
         length = np.linalg.norm(end - sensor) / 0.1
         direction = (end - sensor) / length
@@ -322,10 +322,10 @@ def test_long_rays_go_on_from_step_to_step_of_the_loop(monkeypatch):
     config = dataclasses.replace(CONFIG, voxel_size=0.02)
     beams = beams_to(ends, sensor)
     assert np.max(beams.free_ranges) / 0.02 > 60
-    once = rays.trace_rays(config, empty_grid(config), FIRST, beams)
+    once = carving.trace_rays(config, empty_grid(config), FIRST, beams)
     for chunk in (5, 100):
-        monkeypatch.setattr(rays, "_CHUNK", chunk)
-        again = rays.trace_rays(config, empty_grid(config), FIRST, beams)
+        monkeypatch.setattr(carving, "_CHUNK", chunk)
+        again = carving.trace_rays(config, empty_grid(config), FIRST, beams)
         np.testing.assert_array_equal(again.passes, once.passes)
     longest = np.sum(np.asarray(beams.free_ranges) / 0.02 - 1)
     assert abs(float(once.passes.sum()) - longest) < len(ends)
@@ -414,7 +414,7 @@ def test_a_vanished_wall_is_carved_and_a_new_one_believed():
     for cloud in [near] * 30 + [far] * 60:
         grid = trace(fuse(grid, cloud, sensor), cloud, sensor)
         grid = fade_evidence(CONFIG, grid)
-        features = surface.is_feature(CONFIG, grid.hits, grid.passes, grid.surface.axes)
+        features = patches.is_feature(CONFIG, grid.hits, grid.passes, grid.surface.axes)
         history.append((bool(features[7, 5, 4]), bool(features[11, 5, 4])))
     assert float(jnp.max(grid.hits + grid.passes)) <= CONFIG.evidence_limit * 1.001
     assert history[29] == (True, False)
@@ -556,7 +556,7 @@ def test_grid_distance_of_a_room_is_exact_in_value_sign_and_gradient():
 
 def test_grid_distance_against_brute_force_over_all_patches():
     grid = wall_room(CONFIG, seeds=range(2))
-    features = np.asarray(surface.is_feature(CONFIG, grid.hits, grid.passes, grid.surface.axes))
+    features = np.asarray(patches.is_feature(CONFIG, grid.hits, grid.passes, grid.surface.axes))
     cells = np.argwhere(features)
     mean = np.asarray(grid.surface.mean, np.float64)[features] + cells + CONFIG.corner_index + 0.5
     axes = np.asarray(grid.surface.axes, np.float64)[features]
@@ -652,7 +652,7 @@ def test_the_small_window_is_for_rays_that_reach_half_the_range_along_no_axis():
             window = small if fits else large
             first, size = np.array(window.inner_start), np.array(window.inner_shape)
             # All that lies within the horizon of the rays and of what they hide can change.
-            reach = 0.3 + 0.1 * rays.HIDDEN_VOXELS
+            reach = 0.3 + 0.1 * carving.HIDDEN_VOXELS
             assert (3 + cloud.low_world - reach >= 0.1 * first - 1e-6).all()
             assert (3 + cloud.high_world + reach <= 0.1 * (first + size) + 1e-6).all()
             assert (np.array(window.within) >= 3).all()
@@ -670,7 +670,7 @@ def test_an_empty_grid_answers_the_horizon():
 
 def test_samples_are_near_and_far_and_carry_the_grids_distance():
     grid = wall_room(CONFIG, seeds=range(2))
-    samples = sampling.sample_grid(CONFIG, grid, jax.random.key(0))
+    samples = from_grid.sample_grid(CONFIG, grid, jax.random.key(0))
     assert samples.points_world.shape == (800, 3)
     assert np.asarray(samples.weight).all()
     index, _, inside = geometry.voxel_of(CONFIG, samples.points_world)
@@ -682,7 +682,7 @@ def test_samples_are_near_and_far_and_carry_the_grids_distance():
     assert known[tuple(np.asarray(index).T)].all()
     expected = lookup.grid_sdf(CONFIG, grid.surface, samples.points_world)
     np.testing.assert_allclose(samples.sdf, expected, atol=1e-6)
-    nothing = sampling.sample_grid(CONFIG, empty_grid(), jax.random.key(0))
+    nothing = from_grid.sample_grid(CONFIG, empty_grid(), jax.random.key(0))
     assert not np.asarray(nothing.weight).any()
 
 

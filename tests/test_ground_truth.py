@@ -10,9 +10,7 @@ from scipy.spatial import cKDTree
 
 pytest.importorskip("igl")
 
-from hiosdf_jax.datasets import FrameStream, NpzStream
-from hiosdf_jax.datasets import ground_truth as recorded_truth
-from hiosdf_jax.ground_truth import (
+from hiosdf_jax._src.scoring.visible import (
     Rays,
     grid_scene,
     mesh_scene,
@@ -21,6 +19,8 @@ from hiosdf_jax.ground_truth import (
     sample_visible,
     sensor_path,
 )
+from hiosdf_jax.datasets import FrameStream, NpzStream
+from hiosdf_jax.datasets import ground_truth as recorded_truth
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 HALF = np.array([2.0, 1.5, 1.2])  # of a room around the origin

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import hiosdf_jax as hio
-from hiosdf_jax import local
+from hiosdf_jax._src.samples import from_cloud
 
 CONFIG = hio.Config.light(
     ((-3, -3, -3), (3, 3, 3)), local_points=30, local_ray_samples=8, local_max_range=2.0
@@ -25,25 +25,29 @@ def test_brute_force_distance_against_a_tree():
     points, queries = cloud(), np.random.default_rng(1).uniform(-3, 3, (500, 3)).astype(np.float32)
     valid = np.arange(700) % 3 > 0
     exact, _ = cKDTree(points[valid].astype(np.float64)).query(queries)
-    result = local.nearest_distance(jnp.asarray(queries), jnp.asarray(points), jnp.asarray(valid))
+    result = from_cloud.nearest_distance(
+        jnp.asarray(queries), jnp.asarray(points), jnp.asarray(valid)
+    )
     np.testing.assert_allclose(result, exact, atol=1e-5)
-    none = local.nearest_distance(jnp.asarray(queries), jnp.asarray(points), jnp.zeros(700, bool))
+    none = from_cloud.nearest_distance(
+        jnp.asarray(queries), jnp.asarray(points), jnp.zeros(700, bool)
+    )
     assert np.isinf(np.asarray(none)).all()
 
 
 def test_tiles_do_not_change_the_distance(monkeypatch):
     points, queries = cloud() + 9, cloud(300)  # what fills up the last tile must not be nearer
-    whole = local.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
+    whole = from_cloud.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
     for tile in (64, 256):  # both leave a rest
-        monkeypatch.setattr(local, "_TILE", tile)
-        tiled = local.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
+        monkeypatch.setattr(from_cloud, "_TILE", tile)
+        tiled = from_cloud.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
         np.testing.assert_array_equal(whole, tiled)
 
 
 def test_samples_follow_equations_1_and_2():
     points = cloud()
     valid = np.ones(700, bool)
-    samples = local.sample_local(CONFIG, points, valid, SENSOR, jax.random.key(0))
+    samples = from_cloud.sample_local(CONFIG, points, valid, SENSOR, jax.random.key(0))
     queries = np.asarray(samples.points_world, np.float64)
     exact, _ = cKDTree(points.astype(np.float64)).query(queries)
     np.testing.assert_allclose(np.abs(samples.sdf), exact, atol=1e-5)
@@ -69,10 +73,10 @@ def test_samples_follow_equations_1_and_2():
 def test_padding_changes_nothing():
     points = cloud()
     padded = np.concatenate([points, np.zeros((100, 3), np.float32)])
-    a = local.sample_local(CONFIG, points, np.ones(700, bool), SENSOR, jax.random.key(0))
-    b = local.sample_local(CONFIG, padded, np.arange(800) < 700, SENSOR, jax.random.key(0))
+    a = from_cloud.sample_local(CONFIG, points, np.ones(700, bool), SENSOR, jax.random.key(0))
+    b = from_cloud.sample_local(CONFIG, padded, np.arange(800) < 700, SENSOR, jax.random.key(0))
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x, y)
-    none = local.sample_local(CONFIG, points, np.zeros(700, bool), SENSOR, jax.random.key(0))
+    none = from_cloud.sample_local(CONFIG, points, np.zeros(700, bool), SENSOR, jax.random.key(0))
     assert not np.asarray(none.weight).any()
     assert not np.isnan(np.asarray(none.points_world)).any()

@@ -13,8 +13,8 @@ import pytest
 from room import BOUNDS, CONFIG, HALF, room_cloud, room_sdf, stream
 
 import hiosdf_jax as hio
-from hiosdf_jax import intake, mapping
-from hiosdf_jax.grid import evidence, geometry, surface
+from hiosdf_jax._src.grid import evidence, geometry, patches
+from hiosdf_jax._src.mapping import intake, pipeline
 
 
 def arrays_equal(a, b):
@@ -95,10 +95,10 @@ def test_no_leaf_is_weakly_typed(empty, mapped):
 def test_one_compilation_for_clouds_of_any_size():
     config = dataclasses.replace(CONFIG, hidden_width=8)
     state = hio.init(config, jax.random.key(0))
-    before = mapping._update_jit._cache_size()
+    before = pipeline._update_jit._cache_size()
     for count in (1, 40, 299, 300, 301, 900):
         state = hio.update(state, *room_cloud(count, count))
-    assert mapping._update_jit._cache_size() == before + 1
+    assert pipeline._update_jit._cache_size() == before + 1
     assert int(state.updates) == 6
     assert int(state.report.points_used) == 300
 
@@ -428,7 +428,7 @@ def test_far_returns_are_averaged_like_near_ones():
     @jax.jit
     def fuse(grid, points):
         start, window = evidence.read_evidence(config, grid, sensor)
-        window = surface.fuse_hits(config, window, start, points, jnp.ones(1, bool), sensor)
+        window = patches.fuse_hits(config, window, start, points, jnp.ones(1, bool), sensor)
         return evidence.write_evidence(grid, start, window)
 
     for offset in offsets:
@@ -478,8 +478,8 @@ def test_update_with_64_bit_numbers_enabled():
     code = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"
         "import dataclasses, numpy as np, hiosdf_jax as hio\n"
-        "from hiosdf_jax.grid import geometry\n"
-        "from hiosdf_jax.network import tiles\n"
+        "from hiosdf_jax._src.grid import geometry\n"
+        "from hiosdf_jax._src.network import tiles\n"
         "from room import CONFIG, stream\n"
         # Both windows of a change, and several tiles of the network's rows.
         "config = dataclasses.replace(CONFIG, bounds=((-9, -1, -1), (9, 1, 1)), batches=1,\n"
@@ -497,9 +497,9 @@ def test_update_with_64_bit_numbers_enabled():
 def test_the_schedule_warms_up_and_never_serves_the_untrained_network():
     config = dataclasses.replace(CONFIG, warmup_updates=3, warmup_epochs=7, epochs=2)
     config = dataclasses.replace(config, weight_average=0.8)
-    made = [mapping.schedule(config, jnp.int32(n)) for n in range(7)]
+    made = [pipeline.schedule(config, jnp.int32(n)) for n in range(7)]
     assert [int(extra) for extra, _ in made] == [5, 5, 5, 0, 0, 0, 0]
     short = dataclasses.replace(config, warmup_epochs=1)
-    assert [int(mapping.schedule(short, jnp.int32(n))[0]) for n in (2, 3)] == [0, 1]
+    assert [int(pipeline.schedule(short, jnp.int32(n))[0]) for n in (2, 3)] == [0, 1]
     expected = [0, 1 / 2, 2 / 3, 3 / 4, 4 / 5, 0.8, 0.8]
     np.testing.assert_allclose([float(average) for _, average in made], expected, atol=1e-6)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax import mesh
-from hiosdf_jax.mesh import extract_mesh, mesh_from_samples
-from hiosdf_jax.state import Query
+from hiosdf_jax._src.field import mesh
+from hiosdf_jax._src.field.mesh import extract_mesh, mesh_from_samples
+from hiosdf_jax._src.state import Query
 
 CENTER = np.array([0.13, -0.21, 0.07])
 CORNER = np.array([-1.5, -1.2, -1.4])

@@ -9,9 +9,9 @@ import optax
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax.network import passes, siren, tiles, training
-from hiosdf_jax.network.sine import cosine, sine
-from hiosdf_jax.samples import Samples
+from hiosdf_jax._src.network import siren, tiles, training
+from hiosdf_jax._src.network.fast_sine import cosine, sine
+from hiosdf_jax._src.samples.draw import Samples
 
 BOUNDS = ((-1, -1, -1), (1, 1, 1))
 TINY = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, batches=1, eikonal_every=1)
@@ -215,7 +215,7 @@ def test_which_epochs_are_extra_changes_nothing(monkeypatch, device, every, epoc
         dataclasses.replace(tiny, epochs=5, warmup_epochs=5), network, samples, 5
     )
     monkeypatch.setattr(jax, "default_backend", lambda: device)
-    monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float32)
+    monkeypatch.setattr(forward, "stored_dtype", lambda: jnp.float32)
     config = dataclasses.replace(tiny, epochs=epochs, warmup_epochs=warmup_epochs)
     trained, parts, _ = train(config, network, samples, 5)
     assert int(trained.optimizer[0].count) == 5
@@ -253,7 +253,7 @@ def test_the_padding_of_a_gpus_tile_changes_nothing(monkeypatch, every):
     network, samples = training.init_network(config, jax.random.key(0)), some_samples(72)
     plain, losses, _ = train(config, network, samples, 2)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float32)
+    monkeypatch.setattr(forward, "stored_dtype", lambda: jnp.float32)
     # Each share divides by 256: the 60,000 samples of the paper, the 42,000 of default.
     sizes = [(60_000, 1, 60_160), (60_000, 2, 60_416), (60_000, 4, 60_416), (42_000, 4, 43_008)]
     for rows, groups, size in sizes:
@@ -274,7 +274,7 @@ def test_small_gradients_survive_in_float16(monkeypatch):
     config = dataclasses.replace(TINY, sdf_weight=1e-3, eikonal_weight=1e-3)
     network, samples = training.init_network(config, jax.random.key(0)), some_samples(900)
     exact = train(config, network, samples, 1)[0].optimizer[0].mu
-    monkeypatch.setattr(passes, "stored_dtype", lambda: jnp.float16)
+    monkeypatch.setattr(forward, "stored_dtype", lambda: jnp.float16)
     rounded = train(config, network, samples, 1)[0].optimizer[0].mu
     for a, b in zip(jax.tree.leaves(rounded), jax.tree.leaves(exact), strict=True):
         assert np.linalg.norm(a - b) < 0.02 * np.linalg.norm(b)

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    from hiosdf_jax.planning.barrier import inscribed, velocity_filter
+    from hiosdf_jax._src.planning.adapters.cbf import inscribed, velocity_filter
 
 LIMITS = np.array([0.5, 1.0, 2.0])
 MARGIN, GAIN = 0.05, 4.0

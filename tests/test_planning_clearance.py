@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import hiosdf_jax as hio
 from hiosdf_jax import planning
-from hiosdf_jax.state import Baked
+from hiosdf_jax._src.state import Baked
 
 COUNT = 40  # spheres in nearly every test: what is compiled once serves them all
 RESOLUTION = 0.05

@@ -14,9 +14,13 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import frax
 
-    from hiosdf_jax.planning.barrier import velocity_filter
+    from hiosdf_jax._src.planning.adapters.cbf import velocity_filter
 
-from hiosdf_jax.planning.frax_arm import arm_clearance, arm_clearance_and_grad, arm_spheres
+from hiosdf_jax._src.planning.adapters.frax import (
+    arm_clearance,
+    arm_clearance_and_grad,
+    arm_spheres,
+)
 
 # Denavit-Hartenberg parameters as Franka publishes them (Craig's convention): a m, d m, alpha rad.
 TURN = np.pi / 2

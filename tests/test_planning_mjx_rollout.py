@@ -10,7 +10,7 @@ from analytic import baked
 from mujoco import mjx
 from scene import ROOM, exact_sdf
 
-from hiosdf_jax.planning.mjx_rollout import rollout, sphere_geoms
+from hiosdf_jax._src.planning.adapters.mjx import rollout, sphere_geoms
 
 ROVER = (example.ROVER, 1024, example.HORIZON)
 ARM = (example.ARM, 16, 4)  # its steps take ten times as long

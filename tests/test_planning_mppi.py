@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax.state import Baked
+from hiosdf_jax._src.state import Baked
 
 jax_mppi = pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
-mppi = pytest.importorskip("hiosdf_jax.planning.mppi")
+mppi = pytest.importorskip("hiosdf_jax._src.planning.adapters.mppi")
 
 RADIUS = 0.3  # m, of the robot
 STEP = 0.1  # s

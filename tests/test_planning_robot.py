@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from mujoco import mjx
 
 from hiosdf_jax import planning
+from hiosdf_jax._src.planning.robot import cover, solids
+from hiosdf_jax._src.state import Baked
 from hiosdf_jax.demo import signed_distance
-from hiosdf_jax.planning import cover, solids
-from hiosdf_jax.state import Baked
 
 TOLERANCE = 0.03
 EGG = np.array([0.1, 0.06, 0.04])

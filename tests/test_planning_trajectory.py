@@ -8,7 +8,7 @@ import trajectory as example
 from analytic import baked, count_traces, equalities_with_least, half_space, half_spaces
 from scene import ROOM, exact_sdf
 
-from hiosdf_jax.planning.trajectory import optimize_trajectory, waves
+from hiosdf_jax._src.planning.trajectory import optimize_trajectory, waves
 
 RADIUS, MARGIN = 0.1, 0.15
 

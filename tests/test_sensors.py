@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hiosdf_jax.sensors import depth_to_cloud, ranges_to_cloud
+from hiosdf_jax._src.datasets.sensors import depth_to_cloud, ranges_to_cloud
 
 K = np.array([[160.0, 0.0, 3.5], [0.0, 150.0, 2.5], [0.0, 0.0, 1.0]])
 

@@ -9,8 +9,9 @@ import pytest
 from room import CONFIG, HALF, map_of_room
 
 import hiosdf_jax as hio
-from hiosdf_jax import served, uncertainty
-from hiosdf_jax.grid import lookup
+from hiosdf_jax._src.field import blend
+from hiosdf_jax._src.grid import lookup
+from hiosdf_jax._src.mapping import calibration
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def points_inside(count=400):
 def test_near_surfaces_the_network_corrects_the_grid_by_its_share(field):
     points = points_inside()
     grid = np.asarray(lookup.grid_sdf(CONFIG, field.surface, jnp.asarray(points)), float)
-    network = np.asarray(served.network_sdf(field, jnp.asarray(points)), float)
+    network = np.asarray(blend.network_sdf(field, jnp.asarray(points)), float)
     assert np.abs(network - grid).max() > 0.1 > np.abs(network - grid).min()
     limit = np.minimum(0.1, np.abs(grid))  # surfaces stay where the grid has them
     expected = grid + 0.1 * np.clip(network - grid, -limit, limit)
@@ -39,7 +40,7 @@ def test_beyond_the_horizon_the_network_goes_on_alone():
     field = hio.snapshot(map_of_room(config, jax.random.key(0)))
     x = np.linspace(-3.1, -1.0, 400)
     points = np.stack([x, 0 * x, 0 * x], axis=1).astype(np.float32)
-    network = np.asarray(served.network_sdf(field, jnp.asarray(points)))
+    network = np.asarray(blend.network_sdf(field, jnp.asarray(points)))
     value = np.asarray(hio.sdf(field, points))
     np.testing.assert_allclose(value[x < -2], network[x < -2], atol=1e-6)
     assert np.abs(value - network)[x > -1.1].max() > 0.01
@@ -49,7 +50,7 @@ def test_beyond_the_horizon_the_network_goes_on_alone():
 def test_the_papers_map_is_the_network_alone(field):
     paper = field.replace(config=dataclasses.replace(CONFIG, grid_share=0.0))
     points = jnp.asarray(points_inside())
-    network = served.network_sdf(paper, points)
+    network = blend.network_sdf(paper, points)
     np.testing.assert_allclose(hio.sdf(paper, points), network, atol=1e-6)
 
 
@@ -58,7 +59,7 @@ def test_lower_is_below_and_by_more_where_grid_and_network_disagree(field):
     answer = hio.query(field, points)
     slack = np.asarray(answer.sdf) - np.asarray(answer.lower)
     assert (slack > 0).all()
-    gap = np.abs(served.network_sdf(field, points) - lookup.grid_sdf(CONFIG, field.surface, points))
+    gap = np.abs(blend.network_sdf(field, points) - lookup.grid_sdf(CONFIG, field.surface, points))
     order = np.argsort(gap)
     assert slack[order[-500:]].mean() > 1.2 * slack[order[:500]].mean()
     wilder = field.replace(optimism=field.optimism + 1)
@@ -71,7 +72,7 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
 
     offset = 1.0
 
-    monkeypatch.setattr(served, "cautious_sdf", known)
+    monkeypatch.setattr(blend, "cautious_sdf", known)
     points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 3)), jnp.float32)
     seen = np.asarray(hio.query(field, points).observed)
     assert seen.mean() > 0.5
@@ -84,7 +85,7 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
     field = field.replace(updates=jnp.int32(0), optimism=jnp.float32(9))
 
     def calibrate(field, ends):
-        return float(uncertainty.calibrate(field, points, ends, sensor, jax.random.key(0)))
+        return float(calibration.calibrate(field, points, ends, sensor, jax.random.key(0)))
 
     every = jnp.ones(5000, bool)
     assert abs(calibrate(field, every) - expected) < 0.02
@@ -95,7 +96,7 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
     few = jnp.asarray(seen & (np.cumsum(seen) <= 1))  # drawn 2,000 times: enough, as returns go
     assert calibrate(field, few) != 9
     offset = -1.0  # foretold perfectly: free space still needs some
-    assert calibrate(field, every) == pytest.approx(uncertainty._LEAST)
+    assert calibrate(field, every) == pytest.approx(calibration._LEAST)
 
 
 def test_too_few_seen_returns_calibrate_nothing(field):
@@ -107,7 +108,7 @@ def test_too_few_seen_returns_calibrate_nothing(field):
     sensor = jnp.zeros(3)
     every = jnp.ones(2000, bool)
     points = jnp.asarray(points, jnp.float32)
-    assert float(uncertainty.calibrate(field, points, every, sensor, jax.random.key(0))) == 9
+    assert float(calibration.calibrate(field, points, every, sensor, jax.random.key(0))) == 9
 
 
 def test_the_scale_is_of_gap_and_spread(field):
@@ -115,8 +116,8 @@ def test_the_scale_is_of_gap_and_spread(field):
     rough = field.surface.replace(axes=field.surface.axes.at[..., 2, :].multiply(200.0))
     field = field.replace(surface=rough)  # the room's walls are smooth
     nearest = lookup.nearest_patch(CONFIG, field.surface, points)
-    gap = np.abs(served.network_sdf(field, points) - nearest.sdf)
-    _, scale = served.cautious_sdf(field, points)
+    gap = np.abs(blend.network_sdf(field, points) - nearest.sdf)
+    _, scale = blend.cautious_sdf(field, points)
     spread = np.asarray(nearest.spread)
     assert spread.max() > 0.01
     expected = 0.3 * 0.1 + 0.5 * np.minimum(gap, 0.1) + spread

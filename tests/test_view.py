@@ -9,7 +9,8 @@ import trimesh
 from matplotlib import colormaps
 from matplotlib.image import imread
 
-from hiosdf_jax.view import save_shaded, save_slices, shading, slices
+from hiosdf_jax._src.view import shading, slices
+from hiosdf_jax.view import save_shaded, save_slices
 
 BOUNDS = ((-2.0, -1.0, 0.0), (2.0, 1.0, 1.0))
 

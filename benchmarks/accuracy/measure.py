@@ -13,10 +13,13 @@ import numpy as np
 from tqdm import tqdm
 
 import hiosdf_jax as hio
-from hiosdf_jax import datasets, evaluation, run, served
-from hiosdf_jax.grid import lookup
-from hiosdf_jax.query import as_field
-from hiosdf_jax.state import Field
+from hiosdf_jax import datasets
+from hiosdf_jax._src.command import run
+from hiosdf_jax._src.field import blend
+from hiosdf_jax._src.field.points import as_field
+from hiosdf_jax._src.grid import lookup
+from hiosdf_jax._src.scoring import metrics
+from hiosdf_jax._src.state import Field
 
 # Forgetting is the error in the region of so many first frames, right after them and at the end.
 EARLY_FRAMES = 20
@@ -40,7 +43,7 @@ class Source(NamedTuple):
 
     name: str
     stream: datasets.Stream
-    truth: evaluation.GroundTruth | None
+    truth: metrics.GroundTruth | None
     extent: datasets.Extent
     complete: bool
 
@@ -121,9 +124,9 @@ def measure(
             if source.truth is None:
                 scores = _score_held_out(field, ask, held_out_world)
             else:
-                scores = evaluation.evaluate(ask, source.truth, pose[:3, 3], frame)
+                scores = metrics.evaluate(ask, source.truth, pose[:3, 3], frame)
                 if name == "served":
-                    scores |= evaluation.evaluate_lower(
+                    scores |= metrics.evaluate_lower(
                         lambda points: _lower(field, points),  # noqa: B023 - called at once
                         source.truth,
                         frame,
@@ -136,9 +139,9 @@ def measure(
                 variant["scores"] = scores
             if is_last and source.truth is not None:
                 truth = source.truth
-                variant["bands"] = evaluation.evaluate_bands(ask, truth, pose[:3, 3], frame)
+                variant["bands"] = metrics.evaluate_bands(ask, truth, pose[:3, 3], frame)
                 if name in early:
-                    first = evaluation.evaluate(ask, truth, last_frame=EARLY_FRAMES - 1)
+                    first = metrics.evaluate(ask, truth, last_frame=EARLY_FRAMES - 1)
                     scores["early_then_cm"] = early[name]
                     scores["early_now_cm"] = first["visible_cm"]
     return {
@@ -163,7 +166,7 @@ def _grid_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array
 # The map is an argument, so that each compiles once for all maps of one configuration.
 VARIANTS: dict[str, Callable[..., tuple[jax.Array, jax.Array]]] = {
     "grid": jax.jit(_grid_sdf_and_grad),
-    "network": jax.jit(served.network_sdf_and_grad),
+    "network": jax.jit(blend.network_sdf_and_grad),
     "served": jax.jit(hio.sdf_and_grad),
 }
 _lower = jax.jit(lambda field, points: hio.query(field, points).lower)
@@ -191,21 +194,21 @@ def _score_held_out(
     if not len(points_world):  # the stream is too short to hold frames out
         return {}
     seen = points_world[np.asarray(_observed(field, points_world))]
-    return evaluation.held_out_surface(lambda points: ask(points)[0], seen) if len(seen) else {}
+    return metrics.held_out_surface(lambda points: ask(points)[0], seen) if len(seen) else {}
 
 
 def _with_thin_parts(
-    mesh: Path, stream: datasets.Stream, truth: evaluation.GroundTruth, max_range: float
-) -> evaluation.GroundTruth:
-    from hiosdf_jax import ground_truth
+    mesh: Path, stream: datasets.Stream, truth: metrics.GroundTruth, max_range: float
+) -> metrics.GroundTruth:
+    from hiosdf_jax._src.scoring import visible
 
     try:
-        rays = ground_truth.read_rays(stream, max_range)
-        scene = ground_truth.read_scene(mesh, ground_truth.sensor_path(rays))
+        rays = visible.read_rays(stream, max_range)
+        scene = visible.read_scene(mesh, visible.sensor_path(rays))
     except (FileNotFoundError, ModuleNotFoundError) as error:
         print(f"thin parts are not scored: {error}")
         return truth
-    drawn = ground_truth.sample_visible(scene, rays, count=len(stream))
+    drawn = visible.sample_visible(scene, rays, count=len(stream))
     return truth._replace(thin_points_world=drawn.thin_points_world)
 
 

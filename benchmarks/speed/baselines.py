@@ -10,10 +10,10 @@ import jax
 import numpy as np
 
 from benchmarks.speed.rows import Baseline, Spread, time_ms
-from hiosdf_jax.config import Config
-from hiosdf_jax.network import passes
-from hiosdf_jax.samples import Samples
-from hiosdf_jax.state import Network
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.network import forward
+from hiosdf_jax._src.samples.draw import Samples
+from hiosdf_jax._src.state import Network
 
 
 def training(config: Config, network: Network, samples: Samples, seconds: float) -> list[Baseline]:
@@ -114,7 +114,7 @@ def _by_scipy(label: str, module: str, measure: Callable[[Any], Spread]) -> list
 
 
 def _model(siren: Any, config: Config, params: Any) -> Any:
-    layers = [(np.asarray(k), np.asarray(b)) for k, b in passes.layers_of(params)]
+    layers = [(np.asarray(k), np.asarray(b)) for k, b in forward.layers_of(params)]
     return siren.Siren(layers, config.frequency)
 
 

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.speed.rows import Row, single, time_ms
-from hiosdf_jax.config import Config
-from hiosdf_jax.grid.change import Window
-from hiosdf_jax.grid.distance import pass_order
-from hiosdf_jax.network import passes
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid.change import Window
+from hiosdf_jax._src.grid.distance import pass_order
+from hiosdf_jax._src.network import forward
 
 
 class Limits(NamedTuple):
@@ -64,7 +64,7 @@ def measure(matrix_edge: int, elements: int, seconds: float) -> tuple[Limits, li
     Returns:
         The rates, and rows with them.
     """
-    dtype = jnp.dtype(passes.stored_dtype())
+    dtype = jnp.dtype(forward.stored_dtype())
     key = jax.random.key(0)
     square = jax.random.normal(key, (matrix_edge, matrix_edge), dtype)
     product = time_ms(jax.jit(jnp.matmul), square, square, seconds=seconds)
@@ -119,7 +119,7 @@ def _network_work(config: Config, points: float, products: int) -> Work:
     """
     width, layers = config.hidden_width, config.hidden_layers
     pass_adds = 3 * width + layers * width**2 + width
-    size = jnp.dtype(passes.stored_dtype()).itemsize
+    size = jnp.dtype(forward.stored_dtype()).itemsize
     return Work(
         matrix=2.0 * products * pass_adds * points,
         memory=2.0 * products * layers * width * size * points,

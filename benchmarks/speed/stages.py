@@ -9,15 +9,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax import mapping, uncertainty
-from hiosdf_jax.grid import distance, evidence, frontier, rays, sampling, surface
-from hiosdf_jax.grid.beams import place_cloud
-from hiosdf_jax.grid.change import change_by
-from hiosdf_jax.local import sample_local
-from hiosdf_jax.network import training
-from hiosdf_jax.query import field_of
-from hiosdf_jax.samples import concatenate
-from hiosdf_jax.state import MapState
+from hiosdf_jax._src.field.points import field_of
+from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches
+from hiosdf_jax._src.grid.change import change_by
+from hiosdf_jax._src.grid.rays import place_cloud
+from hiosdf_jax._src.mapping import calibration, pipeline
+from hiosdf_jax._src.network import training
+from hiosdf_jax._src.samples import from_grid
+from hiosdf_jax._src.samples.draw import concatenate
+from hiosdf_jax._src.samples.from_cloud import sample_local
+from hiosdf_jax._src.state import MapState
 
 
 class Stage(NamedTuple):
@@ -59,7 +60,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
 
     stage(
         "calibration",
-        uncertainty.calibrate,
+        calibration.calibrate,
         field_of(state),
         beams.points_world,
         beams.ends & beams.inside,
@@ -71,7 +72,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
     )
     window = stage(
         "fusion",
-        partial(surface.fuse_hits, config),
+        partial(patches.fuse_hits, config),
         window,
         start,
         beams.points_world,
@@ -80,7 +81,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
     )
     window = stage(
         "rays",
-        partial(rays.trace_rays, config),
+        partial(carving.trace_rays, config),
         window,
         start,
         beams,
@@ -101,7 +102,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
     )
     global_samples = stage(
         "grid samples",
-        partial(sampling.sample_grid, config),
+        partial(from_grid.sample_grid, config),
         grid,
         grid_key,
     )
@@ -118,7 +119,7 @@ def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, 
         partial(training.train, config),
         state.network,
         concatenate(global_samples, local_samples),
-        *mapping.schedule(config, state.updates),
+        *pipeline.schedule(config, state.updates),
         order_key,
     )
     return stages

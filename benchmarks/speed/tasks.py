@@ -23,14 +23,16 @@ from tqdm import tqdm
 import hiosdf_jax as hio
 from benchmarks.speed import baselines, limits, stages
 from benchmarks.speed.rows import Baseline, Row, Spread, single, spread_of, time_ms
-from hiosdf_jax import datasets, intake, mapping, served, uncertainty
-from hiosdf_jax.grid import geometry, lookup, surface
-from hiosdf_jax.grid.beams import Beams
-from hiosdf_jax.grid.change import Change, Window, place_windows
-from hiosdf_jax.network import training
-from hiosdf_jax.query import field_of
-from hiosdf_jax.samples import Samples
-from hiosdf_jax.state import Field, MapState
+from hiosdf_jax import datasets
+from hiosdf_jax._src.field import blend
+from hiosdf_jax._src.field.points import field_of
+from hiosdf_jax._src.grid import geometry, lookup, patches
+from hiosdf_jax._src.grid.change import Change, Window, place_windows
+from hiosdf_jax._src.grid.rays import Beams
+from hiosdf_jax._src.mapping import calibration, intake, pipeline
+from hiosdf_jax._src.network import training
+from hiosdf_jax._src.samples.draw import Samples
+from hiosdf_jax._src.state import Field, MapState
 
 Frame = tuple[np.ndarray, np.ndarray]  # cloud (N, 3) m in the sensor's frame, T_world_sensor
 Task = Callable[[], list[Row]]
@@ -39,7 +41,7 @@ _TURNS = 5
 
 OUT_OF_TIME = "not run: --minutes are over"
 
-_HIOSDF = "import sys; from hiosdf_jax.cli import main; sys.exit(main(sys.argv[1:]))"
+_HIOSDF = "import sys; from hiosdf_jax._src.command.cli import main; sys.exit(main(sys.argv[1:]))"
 
 # {label: preset and what is changed of it}, the least memory first: of peaks only the first is a
 # configuration's own for sure.
@@ -247,7 +249,7 @@ def update_rows(bench: Bench, label: str) -> list[Row]:
     bench.states[label] = state
     cloud, pose = bench.frame(len(times_ms) + config.warmup_updates)
     prepared = jax.device_put(intake.prepare(cloud, pose, config.max_points))
-    alone = time_ms(mapping._update_jit, state, *prepared, seconds=bench.sizes.seconds)
+    alone = time_ms(pipeline._update_jit, state, *prepared, seconds=bench.sizes.seconds)
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     resident_mb = _resident_mb(resource.getrusage(resource.RUSAGE_SELF))
     rows = [
@@ -292,7 +294,7 @@ def stage_rows(bench: Bench, label: str) -> list[Row]:
     seen_in = _searched(config, change, config.frontier_voxels)
     window, _, beams = parts["rays"].arguments
     work = {
-        "calibration": limits.calibration_work(config, len(cloud), uncertainty._RETURNS),
+        "calibration": limits.calibration_work(config, len(cloud), calibration._RETURNS),
         **limits.evidence_work(window.passes.size, len(cloud), _steps(config, beams)),
         "distance": limits.distance_work(config, searched),
         "frontier": limits.frontier_work(config, seen_in),
@@ -587,8 +589,8 @@ def _sites(config: hio.Config, grid: Any, window: Window) -> tuple[np.ndarray, n
         for array in (grid.hits, grid.passes)
     )
     axes = geometry.read_window(grid.surface.axes, start, shape)
-    features = surface.is_feature(config, hits, passes, axes)
-    return np.asarray(features), np.asarray(surface.is_doubtful(hits, passes))
+    features = patches.is_feature(config, hits, passes, axes)
+    return np.asarray(features), np.asarray(patches.is_doubtful(hits, passes))
 
 
 def _seen(grid: Any, window: Window) -> np.ndarray:
@@ -641,7 +643,7 @@ def _device_memory() -> dict[str, int]:
     return jax.devices()[0].memory_stats() or {}
 
 
-_network = jax.jit(served.network_sdf_and_grad)
+_network = jax.jit(blend.network_sdf_and_grad)
 
 
 @jax.jit

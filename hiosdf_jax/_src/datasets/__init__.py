@@ -1,0 +1,1 @@
+"""Readers of recorded streams, one layout per module."""

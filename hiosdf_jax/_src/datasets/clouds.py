@@ -1,0 +1,140 @@
+"""A folder of point clouds with a trajectory.
+
+- `*.ply` or `*.pcd`: metres, sensor frame.
+- a trajectory in TUM's format, `timestamp tx ty tz qx qy qz qw` on each line: T_world_sensor.
+
+Clouds whose names are times within the trajectory's (seconds, or nanoseconds as whole numbers) get
+the pose interpolated at that time. Otherwise there must be as many poses as clouds: the poses
+belong to the clouds in the order of their names.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hiosdf_jax._src.datasets.files import parsing
+from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.trajectory import Trajectory, pose_at, read_trajectory
+
+_MAX_GAP = 0.2  # s
+_NANOSECONDS = 1e17  # a time from here on counts nanoseconds
+
+
+def cloud_stream(
+    folder: str | os.PathLike[str], trajectory: str | os.PathLike[str] | None = None
+) -> FrameStream:
+    """Opens a folder of PLY or PCD clouds with a trajectory.
+
+    Args:
+        folder: With `*.ply` or `*.pcd`.
+        trajectory: The file of poses; by default the one .txt or .tum file in the folder.
+
+    Returns:
+        The clouds as a stream, in the order of their times or names; one that cannot be read or
+        has no pose at its time is a bad frame.
+
+    Raises:
+        FileNotFoundError: A file or folder is missing.
+        ValueError: The trajectory is malformed, or is not there, or does not fit the clouds.
+        ModuleNotFoundError: There are .pcd files and pypcd4 is not installed.
+    """
+    folder = Path(folder)
+    clouds = sorted((p for p in folder.iterdir() if p.suffix in _READERS), key=_natural)
+    if not clouds:
+        raise ValueError(f"{folder}: has no .ply or .pcd file")
+    if any(path.suffix == ".pcd" for path in clouds):
+        _require_pypcd4()
+    poses = read_trajectory(_only_trajectory(folder) if trajectory is None else trajectory)
+    stamps = _stamps(clouds, poses)
+
+    def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
+        path = clouds[index]
+        return _READERS[path.suffix](path), pose_at(poses, stamps[index], _MAX_GAP)
+
+    return FrameStream(folder, len(clouds), frame)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sorts 2 before 10."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in _parts(path.stem)]
+
+
+def _parts(text: str) -> list[str]:
+    return [part for part in re.split(r"(\d+)", text) if part]
+
+
+def _only_trajectory(folder: Path) -> Path:
+    found = sorted(path for path in folder.iterdir() if path.suffix in (".txt", ".tum"))
+    if len(found) != 1:
+        names = [path.name for path in found]
+        raise ValueError(f"{folder}: trajectory is one of {names}, expected one .txt or .tum file")
+    return found[0]
+
+
+def _stamps(clouds: list[Path], poses: Trajectory) -> np.ndarray:
+    """When each cloud was taken, (N,) s."""
+    stamps = np.array([_stamp(path) for path in clouds])
+    inside = (stamps >= poses.stamps[0]) & (stamps <= poses.stamps[-1])  # NaN is outside
+    if inside.mean() > 0.5:  # the trajectory may begin late or end early
+        return stamps
+    if len(clouds) == len(poses.stamps):
+        return poses.stamps
+    raise ValueError(
+        f"{poses.source}: {len(poses.stamps)} poses from {poses.stamps[0]:.6f} to "
+        f"{poses.stamps[-1]:.6f} s for the {len(clouds)} clouds {clouds[0].name} to "
+        f"{clouds[-1].name}, expected names that are times in between, or as many poses as clouds"
+    )
+
+
+def _stamp(path: Path) -> float:
+    try:
+        value = float(path.stem)
+    except ValueError:
+        return float("nan")
+    return 1e-9 * value if value >= _NANOSECONDS else value
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    import trimesh
+
+    with parsing(path, "PLY file"):
+        vertices = getattr(trimesh.load(path, process=False), "vertices", None)
+        cloud = np.zeros((0, 3)) if vertices is None else np.asarray(vertices)
+        # trimesh takes an ASCII file that is cut off after a line for a smaller cloud.
+        with open(path, "rb") as file:
+            header = file.read(65536).split(b"end_header")[0].decode("ascii", "replace")
+        count = re.search(r"^element vertex (\d+)", header, re.MULTILINE)
+        _check_count(cloud, int(count[1]) if count else len(cloud))
+    return cloud
+
+
+def _read_pcd(path: Path) -> np.ndarray:
+    from pypcd4 import PointCloud  # pyright: ignore[reportPrivateImportUsage]
+
+    with parsing(path, "PCD file"):
+        content = PointCloud.from_path(path)
+        cloud = content.numpy(("x", "y", "z")).reshape(-1, 3)  # of one point it gives a row
+        _check_count(cloud, content.metadata.points)
+    return cloud
+
+
+def _check_count(cloud: np.ndarray, expected: int) -> None:
+    if len(cloud) != expected:
+        raise ValueError(f"has {len(cloud)} points, expected {expected}")
+
+
+def _require_pypcd4() -> None:
+    try:
+        import pypcd4  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            ".pcd files are read by pypcd4: pip install 'hiosdf_jax[pcd]'"
+        ) from error
+
+
+_READERS: dict[str, Callable[[Path], np.ndarray]] = {".ply": _read_ply, ".pcd": _read_pcd}

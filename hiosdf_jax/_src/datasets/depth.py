@@ -1,0 +1,78 @@
+"""Depth images in files, to clouds.
+
+Pillow decodes them: 16-bit PNG is all that is needed, and matplotlib brings Pillow along anyway
+(imageio would call it, too).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from hiosdf_jax._src.datasets import sensors
+from hiosdf_jax._src.datasets.files import parsing
+
+_to_cloud = jax.jit(sensors.depth_to_cloud)
+
+
+def pinhole(intrinsics: Sequence[float], source: object) -> np.ndarray:
+    """Makes a camera matrix.
+
+    Args:
+        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at integer coordinates.
+        source: Where they come from, for the message.
+
+    Returns:
+        (3, 3) float64, K.
+
+    Raises:
+        ValueError: There are not four, or they are not those of a camera.
+    """
+    values = np.asarray(intrinsics, float)
+    if values.shape != (4,) or not np.isfinite(values).all() or not (values[:2] > 0).all():
+        raise ValueError(
+            f"{source}: intrinsics are {values.tolist()}, expected fx, fy > 0, cx, cy in pixels"
+        )
+    fx, fy, cx, cy = values
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def read_depth(
+    path: str | os.PathLike[str],
+    scale: float,
+    matrix: np.ndarray,
+    size: tuple[int, int] | None = None,
+) -> np.ndarray:
+    """Reads a depth image as a cloud.
+
+    Args:
+        path: PNG of one channel of 16 bits; 0 is no return.
+        scale: Metres = value / scale along the optical axis.
+        matrix: (3, 3) K, pixels.
+        size: Width and height that K is made for; by default it is not checked.
+
+    Returns:
+        (H * W, 3) float32 m, camera frame (x right, y down, z forward), NaN for no return.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not such an image; the message names it.
+    """
+    from PIL import Image
+
+    with parsing(path, "PNG image"), Image.open(path) as image:
+        raw = np.asarray(image)
+    if raw.dtype not in (np.uint16, np.int32) or raw.ndim != 2:  # int32 is Pillow's mode "I"
+        raise ValueError(
+            f"{path}: image of {raw.dtype} with shape {raw.shape}, expected one channel of 16 bits"
+        )
+    if size is not None and raw.shape != size[::-1]:
+        raise ValueError(
+            f"{path}: image of {raw.shape[1]} x {raw.shape[0]} pixels, expected {size[0]} x "
+            f"{size[1]} as in the intrinsics"
+        )
+    depth = raw.astype(np.float32) / np.float32(scale)
+    return np.asarray(_to_cloud(depth, matrix.astype(np.float32)))

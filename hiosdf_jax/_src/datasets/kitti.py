@@ -1,0 +1,82 @@
+"""LiDAR sequences of the KITTI odometry benchmark, and SemanticKITTI.
+
+- `velodyne/NNNNNN.bin`: float32 x y z reflectance, metres; x forward, y left, z up.
+- `calib.txt`: the line `Tr:` has the 12 numbers of T_camera_velodyne.
+- `poses.txt` in the folder, or `../../poses/NAME.txt`: 12 numbers a line, T_world_camera of the
+  left grey camera; line i is scan i.
+
+The world is the first frame of that camera: its y points down. Scans are taken as they are, without
+undoing the motion within one.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from hiosdf_jax._src.datasets.files import numbered_files, read_rows
+from hiosdf_jax._src.datasets.poses import check_pose
+from hiosdf_jax._src.datasets.stream import FrameStream
+
+_BYTES = 16  # a point's
+
+
+def kitti_stream(folder: str | os.PathLike[str]) -> FrameStream:
+    """Opens a sequence of the KITTI odometry benchmark.
+
+    Args:
+        folder: Of one sequence, `sequences/00`, with `velodyne` and `calib.txt`.
+
+    Returns:
+        The scans as a stream; one that is cut off or has no pose is a bad frame.
+
+    Raises:
+        FileNotFoundError: A file or folder is missing.
+        ValueError: A file is not what it should be; the message names it and the line.
+    """
+    folder = Path(folder).absolute()
+    scans = numbered_files(folder / "velodyne", r"(\d+)\.bin")
+    path = folder / "poses.txt"
+    if not path.is_file():
+        path = folder.parent.parent / "poses" / f"{folder.name}.txt"
+    rows, lines = read_rows(path, 12)
+    camera_from_sensor = _calibration(folder / "calib.txt")
+
+    def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
+        number, scan = scans[index]
+        if number >= len(rows):
+            raise ValueError(f"{path}: {len(rows)} poses, none for {scan.name}")
+        world_from_camera = check_pose(_square(rows[number]), f"{path}, line {lines[number]}")
+        return _read_scan(scan), world_from_camera @ camera_from_sensor
+
+    return FrameStream(folder, len(scans), frame)
+
+
+def _read_scan(path: Path) -> np.ndarray:
+    size = path.stat().st_size
+    if size % _BYTES:
+        raise ValueError(f"{path}: {size} bytes, expected a multiple of {_BYTES}; is it cut off?")
+    return np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
+
+
+def _calibration(path: Path) -> np.ndarray:
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for line, text in enumerate(file, 1):
+            key, _, rest = text.partition(":")
+            if key.strip() != "Tr":
+                continue
+            source = f"{path}, line {line}"
+            try:
+                values = np.array([float(word) for word in rest.split()])
+            except ValueError as error:
+                raise ValueError(f"{source}: {error}") from error
+            if len(values) != 12:
+                raise ValueError(f"{source}: {len(values)} numbers, expected 12")
+            return check_pose(_square(values), source)
+    raise ValueError(f"{path}: no line 'Tr:', expected T_camera_velodyne there")
+
+
+def _square(row: np.ndarray) -> np.ndarray:
+    return np.concatenate([row.reshape(3, 4), [[0, 0, 0, 1]]])

@@ -1,0 +1,234 @@
+"""Streams in one `.npz` file: a depth camera, a LiDAR's range images, or clouds one after another.
+
+Common to all: `poses` (F, 4, 4), T_world_sensor in metres. Then one of
+
+- `depth` (F, H, W), `K` (3, 3), `depth_scale`: metres = depth / depth_scale along the optical axis,
+  0 = no return, as are the values listed in `invalid` if it is there;
+- `range` (F, ...), `directions` (..., 3) unit vectors, `range_scale`: metres = range / range_scale,
+  0 = no return;
+- `points_mm` (P, 3) millimetres in the sensor frame, `offsets` (F + 1,): frame i is the rows
+  offsets[i] to offsets[i + 1].
+
+The `eval_*` arrays, where a file has them, are exact distances; see `ground_truth`.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from functools import partial
+
+import jax
+import numpy as np
+from numpy.lib.npyio import NpzFile
+
+from hiosdf_jax._src.datasets import sensors
+from hiosdf_jax._src.datasets.poses import check_pose
+from hiosdf_jax._src.datasets.stream import frame_index
+from hiosdf_jax._src.scoring.metrics import GroundTruth
+
+_depth_to_cloud = jax.jit(sensors.depth_to_cloud)
+_ranges_to_cloud = jax.jit(sensors.ranges_to_cloud)
+
+_Shape = tuple[int | str, ...]  # a letter stands for any length
+
+_LAYOUTS = {  # the key that tells a layout: what else it needs
+    "depth": ("K", "depth_scale"),
+    "range": ("directions", "range_scale"),
+    "points_mm": ("offsets",),
+}
+
+
+class NpzStream:
+    """A `Stream` over one `.npz` file, converting one frame an item.
+
+    The raw arrays are held in memory as they are in the file (compressed npz files cannot be
+    mapped); only the frame asked for is turned into float32 metres.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Loads and checks a file.
+
+        Poses are not checked here beyond their count and shape: a pose that is not rigid makes a
+        bad frame, not a bad file.
+
+        Args:
+            path: The `.npz` file.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It is not an npz file, or a key is missing, misshapen or out of range; the
+                message names the file, the key, what was found and what was expected.
+        """
+        self.path = path
+        with _open(path) as arrays:
+            layouts = [key for key in _LAYOUTS if key in arrays]
+            if len(layouts) != 1:
+                raise ValueError(
+                    f"{path}: has {layouts or 'none'} of the keys {list(_LAYOUTS)}, expected one"
+                )
+            self._layout = layouts[0]
+            keys = ("poses", self._layout, *_LAYOUTS[self._layout])
+            missing = [key for key in keys if key not in arrays]
+            if missing:
+                raise ValueError(
+                    f"{path}: key {missing[0]!r} is missing, expected {list(keys)} in a file with "
+                    f"{self._layout!r}"
+                )
+            if self._layout == "depth" and "invalid" in arrays:
+                keys = (*keys, "invalid")
+            self._arrays = {key: _array(arrays, key, path) for key in keys}
+        check = {"depth": self._check_depth, "range": self._check_range}
+        frames = check.get(self._layout, self._check_points)()
+        self._expect("poses", (frames, 4, 4))
+
+    def __len__(self) -> int:
+        """The number of frames."""
+        return len(self._arrays["poses"])
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """One frame.
+
+        Args:
+            index: -len(self) <= index < len(self).
+
+        Returns:
+            cloud: (N, 3) float32, metres, sensor frame; NaN for pixels or beams without return.
+            pose: (4, 4) float32, T_world_sensor, as it is in the file.
+
+        Raises:
+            IndexError: Index is out of range.
+            ValueError: The pose is not finite or not rigid.
+        """
+        index = frame_index(index, len(self), self.path)
+        pose = check_pose(self._arrays["poses"][index], f"{self.path}: poses[{index}]")
+        if self._layout == "points_mm":
+            offsets = self._arrays["offsets"]
+            rows = self._arrays["points_mm"][offsets[index] : offsets[index + 1]]
+            cloud = rows.astype(np.float32) / np.float32(1000)
+            return cloud, pose
+        raw = self._arrays[self._layout][index]
+        lengths = raw.astype(np.float32) / self._scale
+        lengths[np.isin(raw, self._arrays.get("invalid", ()))] = np.nan
+        return np.asarray(self._to_cloud(lengths)), pose
+
+    def _check_depth(self) -> int:
+        depth, matrix = self._arrays["depth"], self._arrays["K"]
+        self._expect("depth", ("F", "H", "W"))
+        self._expect("K", (3, 3))
+        if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+            raise ValueError(f"{self.path}: K = {matrix.tolist()}, expected focal lengths > 0")
+        self._scale = self._positive("depth_scale")
+        self._to_cloud = partial(_depth_to_cloud, intrinsics=matrix.astype(np.float32))
+        return len(depth)
+
+    def _check_range(self) -> int:
+        ranges = self._arrays["range"]
+        if ranges.ndim < 2:
+            raise ValueError(f"{self.path}: range has shape {ranges.shape}, expected (F, ...)")
+        self._expect("directions", (*ranges.shape[1:], 3))
+        self._scale = self._positive("range_scale")
+        directions = self._arrays["directions"].astype(np.float32)
+        self._to_cloud = partial(_ranges_to_cloud, directions=directions)
+        return len(ranges)
+
+    def _check_points(self) -> int:
+        points, offsets = self._arrays["points_mm"], self._arrays["offsets"]
+        self._expect("points_mm", ("P", 3))
+        if offsets.ndim != 1 or len(offsets) < 1 or offsets.dtype.kind not in "iu":
+            raise ValueError(
+                f"{self.path}: offsets has shape {offsets.shape} and type {offsets.dtype}, "
+                f"expected (F + 1,) integers"
+            )
+        edges = offsets.astype(np.int64)
+        if edges[0] != 0 or edges[-1] != len(points):
+            raise ValueError(
+                f"{self.path}: offsets run from {edges[0]} to {edges[-1]}, "
+                f"expected 0 to the {len(points)} rows of points_mm"
+            )
+        falling = np.flatnonzero(np.diff(edges) < 0)
+        if len(falling):
+            i = falling[0]
+            raise ValueError(
+                f"{self.path}: offsets of frame {i} run from {edges[i]} to {edges[i + 1]}, "
+                f"expected them never to fall"
+            )
+        return len(offsets) - 1
+
+    def _expect(self, key: str, shape: _Shape) -> None:
+        _expect(self._arrays[key], key, shape, self.path)
+
+    def _positive(self, key: str) -> np.float32:
+        self._expect(key, ())
+        value = np.float32(self._arrays[key])
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{self.path}: {key} = {value}, expected a number > 0")
+        return value
+
+
+def ground_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
+    """Reads the exact distances of a file.
+
+    Args:
+        path: The `.npz` file, with all of `eval_visible` (N, 3), `eval_visible_sdf` (N,),
+            `eval_visible_grad` (N, 3), `eval_visible_frame` (N,), `eval_surface` (M, 3) or none.
+
+    Returns:
+        The exact distances, or None if the file has none of these keys.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not an npz file, or some of the keys are missing or misshapen.
+    """
+    keys = ("visible", "visible_sdf", "visible_grad", "visible_frame", "surface")
+    keys = tuple(f"eval_{key}" for key in keys)
+    with _open(path) as arrays:
+        missing = [key for key in keys if key not in arrays]
+        if len(missing) == len(keys):
+            return None
+        if missing:
+            raise ValueError(f"{path}: key {missing[0]!r} is missing, expected {list(keys)}")
+        values = [_array(arrays, key, path) for key in keys]
+    count = len(values[0]) if values[0].ndim else 0
+    shapes = ((count, 3), (count,), (count, 3), (count,), ("M", 3))
+    for key, value, shape in zip(keys, values, shapes, strict=True):
+        _expect(value, key, shape, path)
+    points, sdf, grad, frame, surface = values
+    return GroundTruth(
+        points_world=points.astype(np.float32),
+        sdf=sdf.astype(np.float32),
+        grad=grad.astype(np.float32),
+        frame=frame.astype(np.int32),
+        surface_points_world=surface.astype(np.float32),
+    )
+
+
+def _open(path: str | os.PathLike[str]) -> NpzFile:
+    try:
+        arrays = np.load(path, allow_pickle=False)
+    except (zipfile.BadZipFile, EOFError, ValueError) as error:
+        raise ValueError(f"{path}: not a readable npz file ({error})") from error
+    if not isinstance(arrays, NpzFile):
+        raise ValueError(f"{path}: holds one array, expected an npz file of named arrays")
+    return arrays
+
+
+def _array(arrays: NpzFile, key: str, path: str | os.PathLike[str]) -> np.ndarray:
+    try:
+        value = arrays[key]
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:  # or an object array
+        raise ValueError(f"{path}: key {key!r} cannot be read ({error})") from error
+    if value.dtype.kind not in "fiu":
+        raise ValueError(f"{path}: {key} has type {value.dtype}, expected numbers")
+    return value
+
+
+def _expect(array: np.ndarray, key: str, shape: _Shape, path: str | os.PathLike[str]) -> None:
+    """Raises unless array has the shape, in which a letter stands for any length."""
+    fits = array.ndim == len(shape) and all(
+        isinstance(want, str) or have == want for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        expected = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(f"{path}: {key} has shape {array.shape}, expected {expected}")

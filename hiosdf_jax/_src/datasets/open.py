@@ -1,0 +1,97 @@
+"""Which layout a recorded stream has, told by the file or folder."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hiosdf_jax._src.datasets.clouds import cloud_stream
+from hiosdf_jax._src.datasets.kitti import kitti_stream
+from hiosdf_jax._src.datasets.npz import NpzStream
+from hiosdf_jax._src.datasets.replicacad import replicacad_stream
+from hiosdf_jax._src.datasets.rosbag import rosbag_stream
+from hiosdf_jax._src.datasets.scannet import scannet_stream
+from hiosdf_jax._src.datasets.stream import Stream
+from hiosdf_jax._src.datasets.tum import tum_stream
+
+
+class _Format(NamedTuple):
+    open: Callable[..., Stream]
+    sign: str  # by which it is known, in words
+    fits: Callable[[Path], bool]
+
+
+def _holds(*names: str) -> Callable[[Path], bool]:
+    return lambda path: all((path / name).exists() for name in names)
+
+
+def _is_bag(path: Path) -> bool:
+    return path.is_file() and path.suffix in (".bag", ".mcap", ".db3")
+
+
+def _has_clouds(path: Path) -> bool:
+    return path.is_dir() and any(each.suffix in (".ply", ".pcd") for each in path.iterdir())
+
+
+_FORMATS = {
+    "npz": _Format(NpzStream, "a file .npz", lambda path: path.is_file() and path.suffix == ".npz"),
+    "replicacad": _Format(
+        replicacad_stream, "a folder with traj.txt, results", _holds("traj.txt", "results")
+    ),
+    "scannet": _Format(
+        scannet_stream, "with depth, pose, intrinsic", _holds("depth", "pose", "intrinsic")
+    ),
+    "tum": _Format(
+        tum_stream, "with depth.txt, groundtruth.txt", _holds("depth.txt", "groundtruth.txt")
+    ),
+    "kitti": _Format(kitti_stream, "with velodyne", _holds("velodyne")),
+    "clouds": _Format(cloud_stream, "with *.ply or *.pcd", _has_clouds),
+    "rosbag": _Format(
+        rosbag_stream,
+        "with metadata.yaml, or a file .bag, .mcap, .db3",
+        lambda path: _is_bag(path) or (path / "metadata.yaml").exists(),
+    ),
+}
+
+FORMATS = tuple(_FORMATS)
+
+
+def open_stream(path: str | os.PathLike[str], format: str | None = None, **options: Any) -> Stream:
+    """Opens a recorded stream in any of the layouts that there is a reader for.
+
+    Args:
+        path: The file or folder.
+        format: One of `FORMATS`; by default what the file or folder looks like.
+        **options: Of that layout's reader: `intrinsics` of tum, `trajectory` of clouds,
+            `cloud_topic`, `odometry_topic` and `world_frame` of rosbag.
+
+    Returns:
+        The frames, read one at a time.
+
+    Raises:
+        FileNotFoundError: It, or a file in it, is not there.
+        ValueError: The layout is not known or not clear, has no such option, or a file is not what
+            it should be.
+        ModuleNotFoundError: The layout needs a package that is not installed.
+    """
+    path = Path(path)
+    path.stat()
+    if format is None:
+        fitting = [name for name, each in _FORMATS.items() if each.fits(path)]
+        if len(fitting) != 1:
+            signs = "; ".join(f"{name}: {each.sign}" for name, each in _FORMATS.items())
+            raise ValueError(
+                f"{path}: looks like {fitting or 'no known format'}, expected one ({signs})"
+            )
+        format = fitting[0]
+    if format not in _FORMATS:
+        raise ValueError(f"format = {format!r}, expected one of {list(FORMATS)}")
+    opener = _FORMATS[format].open
+    known = list(inspect.signature(opener).parameters)[1:]
+    for name in options:
+        if name not in known:
+            raise ValueError(f"{name} is not an option of format {format!r}, which has {known}")
+    return opener(path, **options)

@@ -1,0 +1,243 @@
+"""ROS 1 and ROS 2 bags with PointCloud2 messages and tf or odometry.
+
+A cloud's pose is the product of the transforms from its frame up to the root of the tf tree, each
+interpolated at the cloud's own stamp. Where tf does not say how the robot moves, an odometry
+message is the transform from its `header.frame_id` to its `child_frame_id`. Clouds are taken as
+they are, without undoing the motion within a sweep.
+
+The `rosbags` package reads both kinds of bag, without ROS.
+"""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections import defaultdict
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hiosdf_jax._src.datasets.files import parsing
+from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.trajectory import Trajectory
+from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+_CLOUD = "sensor_msgs/msg/PointCloud2"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField's
+
+_Row = tuple[float, Any, Any]  # stamp, translation, rotation
+
+
+def rosbag_stream(
+    path: str | os.PathLike[str],
+    cloud_topic: str | None = None,
+    odometry_topic: str | None = None,
+    world_frame: str | None = None,
+) -> FrameStream:
+    """Opens a ROS 1 or ROS 2 bag.
+
+    Args:
+        path: A `.bag`, `.mcap` or `.db3` file, or the folder of a ROS 2 bag.
+        cloud_topic: Of the PointCloud2 messages; needed where there are several.
+        odometry_topic: Of Odometry messages, which then replace what tf says of their child frame;
+            by default they are used where there is one topic and tf has nothing that moves.
+        world_frame: In which the map is made; by default the root of the tf tree.
+
+    Returns:
+        The clouds as a stream; one without transforms at its time is a bad frame. The bag stays
+        open as long as the stream lives.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The bag cannot be read, a topic is missing or not the only one, or nothing says
+            how the sensor moves.
+        ModuleNotFoundError: rosbags is not installed.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "ROS bags are read by rosbags: pip install 'hiosdf_jax[ros]'"
+        ) from error
+    path = Path(path)
+    with parsing(path, "ROS bag"):
+        # Older ROS 2 bags do not hold their types; those that we read have not changed.
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        reader.open()
+    closing = ExitStack()
+    closing.callback(reader.close)
+    with closing:
+        clouds = _clouds(reader, path, cloud_topic)
+        with parsing(path, "ROS bag"):
+            times, transforms, odometry, first = _scan(reader, clouds)
+        if first is None:
+            raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message")
+        edges = _edges(path, transforms)
+        sensor = _name(first.header.frame_id)
+        if odometry_topic is None and not _moves(edges, sensor) and len(odometry) == 1:
+            odometry_topic = next(iter(odometry))
+        if odometry_topic is not None:
+            if odometry_topic not in odometry:
+                raise ValueError(
+                    f"{path}: odometry_topic = {odometry_topic!r}, expected one of "
+                    f"{sorted(odometry)}"
+                )
+            moved = _edges(path, odometry[odometry_topic])
+            edges |= moved
+            if moved.keys().isdisjoint(path_up(edges, sensor)):
+                raise ValueError(
+                    f"{path}: odometry topic {odometry_topic} moves {list(moved)}, expected one of "
+                    f"{path_up(edges, sensor)}, the frames from the clouds' upwards"
+                )
+        above = path_up(edges, sensor, world_frame)
+        if world_frame is None and not _moves(edges, sensor):
+            raise ValueError(
+                f"{path}: nothing moves above the clouds' frame, {' in '.join(above)}; expected "
+                f"tf, or one of the odometry topics {sorted(odometry)} whose child is one of these "
+                "frames, or a world_frame if the sensor stands still"
+            )
+        kept_open = closing.pop_all()
+
+    def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
+        start, among = times[index]
+        messages = reader.messages(clouds, start=start, stop=start + 1)
+        connection, _, raw = next(m for i, m in enumerate(messages) if i == among)
+        with parsing(f"{path}, {connection.topic} at {start} ns", "PointCloud2"):
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            cloud = cloud_of(message)
+        upwards = path_up(edges, _name(message.header.frame_id), world_frame)
+        return cloud, transform_up(edges, upwards, _seconds(message.header.stamp))
+
+    stream = FrameStream(path, len(times), frame)
+    weakref.finalize(stream, kept_open.close)
+    return stream
+
+
+def cloud_of(message: Any) -> np.ndarray:
+    """Takes the points out of a PointCloud2.
+
+    Args:
+        message: With x, y and z among its fields, of any number type.
+
+    Returns:
+        (height * width, 3) float32.
+
+    Raises:
+        ValueError: A field is missing, or the data are too short.
+    """
+    fields = {field.name: field for field in message.fields}
+    missing = [name for name in "xyz" if name not in fields]
+    if missing:
+        raise ValueError(f"fields are {list(fields)}, expected x, y and z")
+    order = ">" if message.is_bigendian else "<"
+    point = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [order + _TYPES[fields[name].datatype] for name in "xyz"],
+            "offsets": [fields[name].offset for name in "xyz"],
+            "itemsize": message.point_step,
+        }
+    )
+    height, width = int(message.height), int(message.width)
+    if not height * width:
+        return np.zeros((0, 3), np.float32)
+    needed = (height - 1) * message.row_step + width * message.point_step
+    if len(message.data) < needed or message.row_step < width * message.point_step:
+        raise ValueError(
+            f"{len(message.data)} bytes in rows of {message.row_step}, expected {height} x {width} "
+            f"points of {message.point_step}"
+        )
+    strides = (message.row_step, message.point_step)
+    points = np.ndarray((height, width), point, np.ascontiguousarray(message.data), 0, strides)
+    return np.stack([points[name].astype(np.float32).ravel() for name in "xyz"], axis=-1)
+
+
+def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection]:
+    """The connections of the topic with the clouds."""
+    topics = sorted({c.topic for c in reader.connections if c.msgtype == _CLOUD})
+    if topic is None and len(topics) == 1:
+        topic = topics[0]
+    if topic not in topics:
+        raise ValueError(f"{path}: cloud_topic = {topic!r}, expected one of {topics}")
+    return [c for c in reader.connections if c.topic == topic and c.msgtype == _CLOUD]
+
+
+def _scan(
+    reader: AnyReader, clouds: list[Connection]
+) -> tuple[list[tuple[int, int]], list[tuple[str, str, bool, _Row]], dict[str, list], Any]:
+    """Goes once through a bag, one message at a time.
+
+    Returns:
+        When each cloud was recorded, ns, and which one of that time it is; the transforms of tf
+        and those of each odometry topic; the first cloud's message.
+    """
+    wanted = [c for c in reader.connections if c.msgtype in (*_TRANSFORMS, _ODOMETRY)]
+    times: list[tuple[int, int]] = []
+    transforms: list[tuple[str, str, bool, _Row]] = []
+    odometry: dict[str, list] = defaultdict(list)
+    first = None
+    for connection, time, raw in reader.messages([*clouds, *wanted]):
+        if connection.msgtype == _CLOUD:
+            again = bool(times) and times[-1][0] == time
+            times.append((time, times[-1][1] + 1 if again else 0))
+            if first is None:
+                first = reader.deserialize(raw, connection.msgtype)
+            continue
+        message: Any = reader.deserialize(raw, connection.msgtype)
+        if connection.msgtype == _ODOMETRY:
+            pose = message.pose.pose
+            row = _seconds(message.header.stamp), pose.position, pose.orientation
+            names = _name(message.child_frame_id), _name(message.header.frame_id)
+            odometry[connection.topic].append((*names, False, row))
+            continue
+        fixed = connection.topic.endswith("tf_static")
+        for each in message.transforms:
+            row = _seconds(each.header.stamp), each.transform.translation, each.transform.rotation
+            names = _name(each.child_frame_id), _name(each.header.frame_id)
+            transforms.append((*names, fixed, row))
+    return times, transforms, odometry, first
+
+
+def _edges(path: Path, transforms: Iterable[tuple[str, str, bool, _Row]]) -> dict[str, Edge]:
+    """Sorts transforms into one trajectory a child frame; what moves counts, not what is fixed."""
+    rows: dict[tuple[str, bool], list[_Row]] = defaultdict(list)
+    parents: dict[tuple[str, bool], str] = {}
+    for child, parent, fixed, row in transforms:
+        known = parents.setdefault((child, fixed), parent)
+        if known != parent:
+            raise ValueError(f"{path}: frame {child!r} has two parents, {known!r} and {parent!r}")
+        rows[child, fixed].append(row)
+    edges = {}
+    for (child, fixed), parent in sorted(parents.items(), key=lambda item: not item[0][1]):
+        table = rows[child, fixed]
+        table = table[-1:] if fixed else sorted(table, key=lambda row: row[0])
+        motion = Trajectory(
+            stamps=np.array([stamp for stamp, _, _ in table]),
+            positions=np.array([(p.x, p.y, p.z) for _, p, _ in table]),
+            quaternions=np.array([(q.x, q.y, q.z, q.w) for _, _, q in table]),
+            source=f"{path}, {child} in {parent}",
+        )
+        edges[child] = Edge(parent, motion, fixed)
+    return edges
+
+
+def _moves(edges: dict[str, Edge], frame: str) -> bool:
+    return any(not edges[child].fixed for child in path_up(edges, frame)[:-1])
+
+
+def _name(frame: str) -> str:
+    return frame.lstrip("/")  # tf of old wrote it so
+
+
+def _seconds(stamp: Any) -> float:
+    return stamp.sec + 1e-9 * stamp.nanosec

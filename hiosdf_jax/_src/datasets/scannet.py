@@ -1,0 +1,55 @@
+"""Frames of a ScanNet scene, as its SensReader exports them.
+
+- `depth/N.png`: 16 bits, millimetres along the optical axis; x right, y down, z forward.
+- `pose/N.txt`: 4 lines of 4 numbers, T_world_camera; -inf where the tracking was lost.
+- `intrinsic/intrinsic_depth.txt`: 4 lines of 4 numbers, K in the upper left.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from hiosdf_jax._src.datasets.depth import pinhole, read_depth
+from hiosdf_jax._src.datasets.files import numbered_files, read_rows
+from hiosdf_jax._src.datasets.poses import check_pose
+from hiosdf_jax._src.datasets.stream import FrameStream
+
+_SCALE = 1000.0  # depth is in millimetres
+
+
+def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
+    """Opens the exported frames of a ScanNet scene.
+
+    Args:
+        folder: With `depth`, `pose` and `intrinsic`.
+
+    Returns:
+        The depth images as a stream; one without a pose, or with ScanNet's -inf, is a bad frame.
+
+    Raises:
+        FileNotFoundError: A file or folder is missing.
+        ValueError: A file is not what it should be; the message names it and the line.
+    """
+    folder = Path(folder)
+    images = numbered_files(folder / "depth", r"(\d+)\.png")
+    path = folder / "intrinsic" / "intrinsic_depth.txt"
+    values = _matrix(path)
+    matrix = pinhole([values[0, 0], values[1, 1], values[0, 2], values[1, 2]], path)
+
+    def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
+        number, image = images[index]
+        source = folder / "pose" / f"{number}.txt"
+        pose = check_pose(_matrix(source), str(source))
+        return read_depth(image, _SCALE, matrix), pose
+
+    return FrameStream(folder, len(images), frame)
+
+
+def _matrix(path: Path) -> np.ndarray:
+    rows, _ = read_rows(path, 4)
+    if len(rows) != 4:
+        raise ValueError(f"{path}: {len(rows)} lines, expected 4")
+    return rows

@@ -1,0 +1,119 @@
+"""Trajectories with time stamps, and poses between them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from hiosdf_jax._src.datasets.files import read_rows
+
+_NEAR = 0.02  # s; a pose this near may stand in where there is none on both sides
+_UNIT_TOLERANCE = 0.01  # on the length of a quaternion; real ones are written with few digits
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """Poses over time.
+
+    Attributes:
+        stamps: (F,) float64 s, never falling.
+        positions: (F, 3) float64 m, in the parent frame.
+        quaternions: (F, 4) float64, x y z w, of T_parent_child.
+        source: Where the poses come from, for messages.
+        lines: (F,) line numbers, if it is a file.
+    """
+
+    stamps: np.ndarray
+    positions: np.ndarray
+    quaternions: np.ndarray
+    source: str
+    lines: Sequence[int] | None = None
+
+    def place(self, index: int) -> str:
+        """Names one pose, for messages."""
+        if self.lines is None:
+            return f"{self.source}, at {self.stamps[index]:.6f} s"
+        return f"{self.source}, line {self.lines[index]}"
+
+
+def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Reads a trajectory in TUM's format: `timestamp tx ty tz qx qy qz qw` on each line.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The poses as they are in the file; whether they are usable is for `pose_at` to say.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: A line is malformed or earlier than the one before, or there is none.
+    """
+    rows, lines = read_rows(path, 8)
+    if not len(rows):
+        raise ValueError(f"{path}: no pose in it")
+    early = np.flatnonzero(~(np.diff(rows[:, 0]) >= 0))
+    if len(early):
+        i = early[0] + 1
+        raise ValueError(
+            f"{path}, line {lines[i]}: time {rows[i, 0]:.6f} s after {rows[i - 1, 0]:.6f} s, "
+            "expected times that never fall"
+        )
+    return Trajectory(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
+
+
+def pose_at(trajectory: Trajectory, stamp: float, max_gap: float) -> np.ndarray:
+    """Interpolates a trajectory: linearly in position, along the great arc in rotation.
+
+    Args:
+        trajectory: The poses.
+        stamp: s.
+        max_gap: s; between poses farther apart than this nothing is interpolated, but a pose
+            nearer than 0.02 s is taken as it is.
+
+    Returns:
+        (4, 4) float64, T_parent_child.
+
+    Raises:
+        ValueError: There is no pose for this time, or those there are are not finite or have no
+            unit quaternion; the message names the source, and the line if it is a file.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    stamps = trajectory.stamps
+    after = int(np.searchsorted(stamps, stamp))
+    around = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
+    nearest = min(around, key=lambda i: abs(stamps[i] - stamp))
+    if len(around) == 2 and stamps[nearest] != stamp and np.ptp(stamps[around]) <= max_gap:
+        positions, rotations = zip(*(_checked(trajectory, i) for i in around), strict=True)
+        share = (stamp - stamps[around[0]]) / np.ptp(stamps[around])
+        position = (1 - share) * positions[0] + share * positions[1]
+        rotation = Slerp([0, 1], Rotation.concatenate(rotations))(share)
+    elif abs(stamps[nearest] - stamp) <= _NEAR:
+        position, rotation = _checked(trajectory, nearest)
+    else:
+        raise ValueError(
+            f"{trajectory.source}: no pose for {stamp:.6f} s; the nearest is "
+            f"{abs(stamps[nearest] - stamp):.3f} s away, expected {_NEAR} s, or poses on both "
+            f"sides that are at most {max_gap} s apart"
+        )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
+
+
+def _checked(trajectory: Trajectory, index: int):  # noqa: ANN202, scipy is imported when used
+    from scipy.spatial.transform import Rotation
+
+    position, quaternion = trajectory.positions[index], trajectory.quaternions[index]
+    if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
+        raise ValueError(f"{trajectory.place(index)}: pose has values that are not finite")
+    length = np.linalg.norm(quaternion)
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        raise ValueError(
+            f"{trajectory.place(index)}: quaternion has length {length:.4g}, expected 1"
+        )
+    return position, Rotation.from_quat(quaternion)

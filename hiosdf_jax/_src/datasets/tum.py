@@ -1,0 +1,81 @@
+"""Sequences of the TUM RGB-D benchmark, and others in its layout.
+
+- `depth.txt`: `timestamp filename` on each line.
+- the images: PNG of 16 bits, metres = value / 5000 along the optical axis; x right, y down,
+  z forward.
+- `groundtruth.txt`: `timestamp tx ty tz qx qy qz qw`, T_world_camera, seconds and metres.
+
+Poses are interpolated at the time of the image. The lens's distortion stays as it is: the depth is
+registered to the colour image, and its authors advise against undoing it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hiosdf_jax._src.datasets.depth import pinhole, read_depth
+from hiosdf_jax._src.datasets.files import read_words
+from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.trajectory import pose_at, read_trajectory
+
+_SCALE = 5000.0
+_MAX_GAP = 0.2  # s; the motion capture gives 100 poses a second, where it sees the camera
+_SIZE = (640, 480)
+# fx, fy, cx, cy of the colour cameras, to which the depth is registered, from the benchmark's site.
+_FREIBURG = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+}
+
+
+def tum_stream(
+    folder: str | os.PathLike[str], intrinsics: Sequence[float] | None = None
+) -> FrameStream:
+    """Opens a sequence in the layout of the TUM RGB-D benchmark.
+
+    Args:
+        folder: With `depth.txt` and `groundtruth.txt`.
+        intrinsics: fx, fy, cx, cy in pixels; by default those of the benchmark's camera that the
+            folder's name tells (freiburg1, 2 or 3).
+
+    Returns:
+        The depth images as a stream; one at a time without a pose is a bad frame.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        ValueError: A file is not what it should be, with its name and the line; or the camera is
+            not known.
+    """
+    folder = Path(folder)
+    images = []
+    for line, (stamp, name) in read_words(folder / "depth.txt", 2):
+        try:
+            images.append((float(stamp), folder / name))
+        except ValueError as error:
+            raise ValueError(f"{folder / 'depth.txt'}, line {line}: {error}") from error
+    if not images:
+        raise ValueError(f"{folder / 'depth.txt'}: no image in it")
+    trajectory = read_trajectory(folder / "groundtruth.txt")
+    size = None
+    if intrinsics is None:
+        found = re.search(r"(?:freiburg|fr)([123])(?!\d)", folder.absolute().name)
+        if not found:
+            raise ValueError(
+                f"{folder}: intrinsics are not known, expected them to be given or a folder named "
+                "after freiburg1, freiburg2 or freiburg3"
+            )
+        intrinsics, size = _FREIBURG[found[1]], _SIZE
+    matrix = pinhole(intrinsics, folder)
+
+    def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
+        stamp, image = images[index]
+        pose = pose_at(trajectory, stamp, _MAX_GAP)
+        return read_depth(image, _SCALE, matrix, size), pose
+
+    return FrameStream(folder, len(images), frame)

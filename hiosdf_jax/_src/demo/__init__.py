@@ -1,0 +1,1 @@
+"""A simulated apartment with exact distances, and a robot that explores it."""

@@ -1,0 +1,1 @@
+"""Queries: distances, gradients, lower bounds, baked fields and meshes."""

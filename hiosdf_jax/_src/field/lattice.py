@@ -1,0 +1,80 @@
+"""A regular lattice of samples over a box, and trilinear interpolation between them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.state import Baked
+
+_MOST_SAMPLES = 2**31 - 1
+
+
+def sample_counts(size: Any, resolution: float) -> tuple[int, int, int]:
+    """Says how many samples cover a box, on both of its faces along each axis or beyond.
+
+    Args:
+        size: (3,) edges of the box, m.
+        resolution: Spacing, m.
+
+    Returns:
+        Samples along x, y and z, each at least 2.
+
+    Raises:
+        ValueError: The spacing is not positive, or would take too many samples.
+    """
+    check_resolution(resolution)
+    # Tolerant, so that 3 m at 0.1 m are 31 samples and not 32.
+    intervals = np.ceil(np.asarray(size, float) / resolution - 1e-6)
+    x, y, z = (int(n) + 1 for n in np.maximum(intervals, 1))
+    if x * y * z > _MOST_SAMPLES:
+        raise ValueError(f"resolution is {resolution} m: {x * y * z} samples are too many")
+    return x, y, z
+
+
+def check_resolution(resolution: float) -> None:
+    """Raises a ValueError if a spacing, m, is not positive."""
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise ValueError(f"resolution is {resolution} m, expected > 0")
+
+
+def bounds(baked: Baked) -> tuple[jax.Array, jax.Array]:
+    """The corners of the box that a baked field covers, (3,) m each, world frame."""
+    last = jnp.asarray(baked.sdf.shape, jnp.float32) - 1
+    return baked.corner_world, baked.corner_world + last * baked.resolution
+
+
+def interpolate(baked: Baked, values: jax.Array, points_world: jax.Array) -> jax.Array:
+    """Interpolates samples trilinearly.
+
+    Args:
+        baked: The baked field.
+        values: (X, Y, Z), one of its arrays.
+        points_world: (..., 3) m, inside its box.
+
+    Returns:
+        (...). Differentiable: the gradient is that of the trilinear function.
+    """
+    shape = values.shape
+    lattice_points = (points_world - baked.corner_world) / baked.resolution
+    base = jnp.floor(jax.lax.stop_gradient(lattice_points))
+    base = jnp.clip(base, 0, jnp.asarray(shape, jnp.float32) - 2)
+    fraction = lattice_points - base
+    x, y, z = (base[..., k].astype(jnp.int32) for k in range(3))
+    flat = values.ravel()
+    first = (x * shape[1] + y) * shape[2] + z
+
+    def along_z(start: jax.Array) -> jax.Array:
+        low, high = flat[start], flat[start + 1]
+        return low + fraction[..., 2] * (high - low)
+
+    def along_yz(start: jax.Array) -> jax.Array:
+        low, high = along_z(start), along_z(start + shape[2])
+        return low + fraction[..., 1] * (high - low)
+
+    low, high = along_yz(first), along_yz(first + shape[1] * shape[2])
+    return low + fraction[..., 0] * (high - low)

@@ -1,0 +1,1 @@
+"""The coarse global grid (paper, section IV-B), one stage per module."""

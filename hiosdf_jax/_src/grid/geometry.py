@@ -1,0 +1,192 @@
+"""Voxels and metres: the lattice, windows of the grid, the eight voxels around a point.
+
+Voxel i of the lattice covers [i, i + 1) * voxel_size along an axis of the world frame; the grid
+holds the lattice's voxels from `config.corner_index` on. Which voxel a point falls in does
+therefore not depend on the bounds, and a grown map answers bit by bit as before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.numerics.vectors import Vector, each, split
+
+FRONTIER_STEPS = 127
+"""`Surface.frontier` counts steps, so many to the horizon."""
+
+
+def frontier_step_m(config: Config) -> float:
+    """The length of such a step, m."""
+    return config.frontier_horizon / FRONTIER_STEPS
+
+
+def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds the voxels that contain points.
+
+    Args:
+        config: The map's configuration.
+        points_world: (..., 3) m.
+
+    Returns:
+        index: (..., 3) int32 into the grid; the nearest voxel for points outside.
+        offset: (..., 3) from the voxel's centre, voxels, in [-0.5, 0.5) for points inside.
+        inside: (...) bool; False for a point with a NaN.
+    """
+    lattice = points_world / config.voxel_size
+    corner = jnp.asarray(config.corner_index, lattice.dtype)
+    shape = jnp.asarray(config.grid_shape, lattice.dtype)
+    # Compared as floats: a far point would overflow an int32.
+    cell = jnp.floor(lattice) - corner
+    inside = jnp.all((cell >= 0) & (cell < shape), axis=-1)
+    cell = jnp.clip(cell, 0, shape - 1)
+    offset = lattice - (cell + corner) - 0.5
+    return jnp.nan_to_num(cell).astype(jnp.int32), offset, inside
+
+
+def voxel_of_window(
+    config: Config, start: jax.Array, shape: tuple[int, ...], points_world: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds the voxels of a part of the grid that contain points.
+
+    Args:
+        config: The map's configuration.
+        start: (3,) int32, the part's first voxel.
+        shape: Its shape.
+        points_world: (..., 3) m.
+
+    Returns:
+        As `voxel_of`, for that part; indices of points outside of it mean nothing.
+    """
+    index, offset, inside = voxel_of(config, points_world)
+    index = index - start
+    within = jnp.all((index >= 0) & (index < jnp.asarray(shape, jnp.int32)), axis=-1)
+    return index, offset, inside & within
+
+
+def voxel_center(config: Config, index: jax.Array) -> jax.Array:
+    """Finds the centres of voxels.
+
+    Args:
+        config: The map's configuration.
+        index: (..., 3) int32 into the grid.
+
+    Returns:
+        (..., 3) m, world frame.
+    """
+    lattice = index + jnp.asarray(config.corner_index, jnp.int32)
+    return (lattice.astype(jnp.float32) + 0.5) * config.voxel_size
+
+
+def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:
+    """Turns indices of an array of this shape, (...) each, into those of the raveled one, (...)."""
+    return (index[0] * shape[1] + index[1]) * shape[2] + index[2]
+
+
+class Corners(NamedTuple):
+    """The eight voxels whose centres surround points, with the weights of trilinear interpolation.
+
+    Attributes:
+        index: (..., 8) int32 each, as into the grid; at the border some lie beyond it.
+        flat: (..., 8) int32 into the raveled grid, of the nearest voxel for those beyond it.
+        inside: (..., 8) bool.
+        weight: (..., 8), adding up to 1.
+    """
+
+    index: Vector
+    flat: jax.Array
+    inside: jax.Array
+    weight: jax.Array
+
+
+# Of each axis: whether a corner is the upper one along it.
+_UPPER = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32).T
+
+
+def corners_of(config: Config, points_world: jax.Array) -> Corners:
+    """Finds the eight voxels whose centres surround points.
+
+    Args:
+        config: The map's configuration.
+        points_world: (..., 3) m, finite, inside the bounds.
+
+    Returns:
+        The corners; the first is the lowest along all axes.
+    """
+
+    def along(lattice: jax.Array, first: int, upper: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        base = jnp.floor(lattice)
+        fraction = (lattice - base)[..., None]
+        index = (base.astype(jnp.int32) - first)[..., None] + upper
+        return index, jnp.where(upper == 1, fraction, 1 - fraction)
+
+    lattice = split(points_world / config.voxel_size - 0.5)
+    parts = [along(*axis) for axis in zip(lattice, config.corner_index, _UPPER, strict=True)]
+    index = (parts[0][0], parts[1][0], parts[2][0])
+    nearest = each(lambda i, n: jnp.clip(i, 0, n - 1), index, config.grid_shape)
+    x, y, z = each(jnp.equal, index, nearest)
+    weight = parts[0][1] * parts[1][1] * parts[2][1]
+    return Corners(index, flat_index(config.grid_shape, nearest), x & y & z, weight)
+
+
+def clamp(config: Config, points_world: jax.Array) -> jax.Array:
+    """Moves (..., 3) points outside the bounds, m, to the nearest point of the box."""
+    low, high = jnp.asarray(config.bounds, points_world.dtype)
+    return clip_to_box(points_world, low, high)
+
+
+def clip_to_box(points: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Moves (..., 3) points outside a box to its nearest point.
+
+    Unlike jnp.clip, which halves the gradient on the faces.
+    """
+    return jnp.where(points < low, low, jnp.where(points > high, high, points))
+
+
+def window_shape(config: Config, reach: float) -> tuple[int, int, int]:
+    """Shape of the part of the grid within `reach` metres of a point, along the axes."""
+    span = 2 * math.ceil(reach / config.voxel_size) + 1
+    x, y, z = config.grid_shape
+    return (min(x, span), min(y, span), min(z, span))
+
+
+def window_start(
+    config: Config, shape: tuple[int, int, int], center_world: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """First voxel of the window of this shape around a point, moved to lie inside the grid.
+
+    Args:
+        config: The map's configuration.
+        shape: Of the window, no larger than the grid.
+        center_world: (3,) m.
+
+    Returns:
+        Three int32 scalars.
+    """
+    index, _, _ = voxel_of(config, center_world)
+    room = jnp.asarray(config.grid_shape, jnp.int32) - jnp.asarray(shape, jnp.int32)
+    start = jnp.clip(index - jnp.asarray(shape, jnp.int32) // 2, 0, room)
+    return start[0], start[1], start[2]
+
+
+def read_window(
+    array: jax.Array, start: tuple[jax.Array, ...], shape: tuple[int, int, int]
+) -> jax.Array:
+    """Cuts the window out of a grid array; axes after the third come along whole."""
+    rest = array.shape[3:]
+    return jax.lax.dynamic_slice(array, _full_start(start, rest), (*shape, *rest))
+
+
+def write_window(array: jax.Array, start: tuple[jax.Array, ...], values: jax.Array) -> jax.Array:
+    """Puts a window's values back into a grid array."""
+    return jax.lax.dynamic_update_slice(array, values, _full_start(start, array.shape[3:]))
+
+
+def _full_start(start: tuple[jax.Array, ...], rest: tuple[int, ...]) -> tuple[jax.Array, ...]:
+    # Of one type: a plain 0 would be an int64 where the user has enabled those.
+    return (*start, *(jnp.zeros((), jnp.int32) for _ in rest))

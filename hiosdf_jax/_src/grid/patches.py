@@ -1,0 +1,243 @@
+"""Hits become sub-voxel surface patches: running weighted mean and principal axes per voxel.
+
+The spread of the hits in a voxel tells what lies in it: a disc-like one is a piece of a wall, a
+rod-like one a table leg, a ball a corner. Its principal axes are kept instead of a covariance
+matrix: they are what a query needs, and the matrix follows from them.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
+from hiosdf_jax._src.state import Grid
+
+# The half extent of a patch along a principal axis, in standard deviations: sqrt(3) for hits that
+# are uniform along it, and a little less since noise widens the spread. Measured: 0.60 cm instead
+# of 0.62 cm on a depth stream, 0.71 instead of 0.73 on a LiDAR stream.
+_EXTENT_DEVIATIONS = 0.9 * 3**0.5
+
+# Axes shorter than this (voxels) are stored with it, so that a perfect plane keeps its normal.
+_LEAST_DEVIATION = 1e-3
+
+# Axes shorter than this (voxels), twice the least, have no direction but that of rounding.
+_LEAST_DIRECTED = 2e-3
+
+_JACOBI_SWEEPS = 5
+
+# Patches smaller than this (voxels^2) are asked for as many hits as one of this area: stray returns
+# are small as well.
+_LEAST_AREA = 0.2
+
+# Voxels whose rays ended in them at least this often may hold a surface, whatever else they say.
+_DOUBT_RATIO = 0.02
+
+
+def fuse_hits(
+    config: Config,
+    window: Grid,
+    start: jax.Array,
+    points_world: jax.Array,
+    valid: jax.Array,
+    sensor_world: jax.Array,
+) -> Grid:
+    """Merges the ends of rays into the surface statistics of their voxels.
+
+    Args:
+        config: The map's configuration.
+        window: The grid, or a part of it.
+        start: (3,) int32, that part's first voxel.
+        points_world: (N, 3) m.
+        valid: (N,) bool; other rows change nothing.
+        sensor_world: (3,) m.
+
+    Returns:
+        The window with new hits, weight, mean and axes.
+    """
+    count = points_world.shape[0]
+    shape = window.hits.shape
+    voxels = shape[0] * shape[1] * shape[2]
+    index, offset, inside = geometry.voxel_of_window(config, start, shape, points_world)
+    voxel = jnp.where(valid & inside, geometry.flat_index(shape, split(index)), voxels)
+
+    # Rows of one voxel become neighbours, so that sums cost the cloud's size, not the grid's.
+    order = jnp.argsort(voxel)
+    voxel, offset = voxel[order], offset[order]
+    first = jnp.concatenate([jnp.ones(1, bool), voxel[1:] != voxel[:-1]])
+    group = jnp.cumsum(first) - 1
+    target = jnp.full(count, voxels, voxel.dtype).at[group].set(voxel)
+    used = (voxel < voxels).astype(jnp.float32)
+
+    ranges = length(split(points_world[order] - sensor_world))
+    noise_floor, noise_growth = config.range_noise
+    weight = used / (1 + noise_growth / noise_floor * ranges**2) ** 2
+    offset = jnp.where(used[:, None] > 0, offset, 0)
+
+    def total(values: jax.Array) -> jax.Array:
+        return jax.ops.segment_sum(values, group, count, indices_are_sorted=True)
+
+    new_hits, new_weight = total(used), total(weight)
+    share = 1 / jnp.maximum(new_weight, 1e-30)
+    new_mean = total(weight[:, None] * offset) * share[:, None]
+    centered = offset - new_mean[group]
+    products = centered[:, :, None] * centered[:, None, :]
+    new_spread = total(weight[:, None, None] * products) * share[:, None, None]
+
+    # Chan's rule merges the two means and covariances.
+    old_hits, old_weight, old_mean, old_axes = (
+        array.reshape(voxels, *array.shape[3:])[jnp.minimum(target, voxels - 1)].astype(jnp.float32)
+        for array in (window.hits, window.weight, window.surface.mean, window.surface.axes)
+    )
+    old_spread = jnp.einsum("nki,nkj->nij", old_axes, old_axes)
+    part = new_weight / jnp.maximum(old_weight + new_weight, 1e-30)
+    step = new_mean - old_mean
+    mean = old_mean + part[:, None] * step
+    spread = (
+        (1 - part)[:, None, None] * old_spread
+        + part[:, None, None] * new_spread
+        + (part * (1 - part))[:, None, None] * step[:, :, None] * step[:, None, :]
+    )
+    deviation, direction = principal_axes(spread)
+    target_index = jnp.stack(jnp.unravel_index(jnp.minimum(target, voxels - 1), shape), axis=-1)
+    center_world = geometry.voxel_center(config, start + target_index)
+    to_sensor = (sensor_world - center_world) / config.voxel_size - mean
+    direction = _face_sensor(deviation, direction, to_sensor)
+    axes = jnp.maximum(deviation, _LEAST_DEVIATION)[:, :, None] * direction
+
+    def put(array: jax.Array, values: jax.Array) -> jax.Array:
+        flat = array.reshape(voxels, *array.shape[3:])
+        return flat.at[target].set(values.astype(array.dtype), mode="drop").reshape(array.shape)
+
+    return window.replace(
+        hits=put(window.hits, old_hits + new_hits),
+        weight=put(window.weight, old_weight + new_weight),
+        surface=window.surface.replace(
+            mean=put(window.surface.mean, mean), axes=put(window.surface.axes, axes)
+        ),
+    )
+
+
+def _face_sensor(deviation: jax.Array, direction: jax.Array, to_sensor: jax.Array) -> jax.Array:
+    """Turns the last principal axis, the normal, to the sensor's side.
+
+    Two hits, or several on a line, do not tell it: then it is what the line leaves of the direction
+    to the sensor, since the surface was seen from there.
+
+    Args:
+        deviation: (N, 3) along the axes, descending, voxels.
+        direction: (N, 3, 3) the axes, unit vectors as rows.
+        to_sensor: (N, 3) voxels.
+
+    Returns:
+        (N, 3, 3) the axes.
+    """
+    along = jnp.sum(direction * to_sensor[:, None, :], axis=-1)
+    told = deviation >= _LEAST_DIRECTED
+    faces_away = along[:, 2:] < 0
+    first, normal = direction[:, 0], jnp.where(faces_away, -1.0, 1.0) * direction[:, 2]
+    across = to_sensor - jnp.where(told[:, :1], along[:, :1], 0) * first
+    far = length(split(across))[:, None]
+    line = ~told[:, 1:2] & (far > 1e-3)
+    normal = jnp.where(line, across / jnp.maximum(far, 1e-3), normal)
+    middle = jnp.where(line, jnp.cross(normal, first), direction[:, 1])
+    return jnp.stack([first, middle, normal], axis=1)
+
+
+def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Array) -> jax.Array:
+    """Tells the voxels whose patch counts as surface: hit often enough, and seldom seen through.
+
+    A patch that fills its voxel stops every ray, a leg or a pole lets most of them pass beside it:
+    what is asked for falls with the patch's area.
+
+    Args:
+        config: The map's configuration.
+        hits: (...) rays that ended in the voxel.
+        passes: (...) rays that went through it.
+        axes: (..., 3, 3) as in `Surface.axes`.
+
+    Returns:
+        (...) bool.
+    """
+    half = _EXTENT_DEVIATIONS * jnp.sqrt(jnp.sum(axes.astype(jnp.float32) ** 2, axis=-1))
+    area = jnp.prod(jnp.minimum(2 * half[..., :2], 1), axis=-1)
+    ratio = config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
+    return (hits >= config.min_hits) & (hits >= ratio * (hits + passes))
+
+
+def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
+    """Tells the voxels that may hold a surface: features, and those that are nearly ones.
+
+    Args:
+        hits: (...) rays that ended in the voxel.
+        passes: (...) rays that went through it.
+
+    Returns:
+        (...) bool.
+    """
+    return (hits > 0) & (hits >= _DOUBT_RATIO * (hits + passes))
+
+
+def patch_offset(point: Vector, mean: Vector, axes: tuple[Vector, Vector]) -> Vector:
+    """Vector from the nearest point of a patch to a point.
+
+    A patch is the rectangle around `mean` that the two longest principal axes span; rods and
+    single hits are the cases in which one or both of them are short.
+
+    Args:
+        point: Voxels.
+        mean: Centre of the patch, same frame and unit.
+        axes: The first two principal axes as in `Surface.axes`, voxels.
+
+    Returns:
+        Voxels; its length is the distance.
+    """
+    offset = each(jnp.subtract, point, mean)
+    for axis in axes:
+        half = each(lambda a: _EXTENT_DEVIATIONS * a, axis)
+        square = jnp.maximum(dot(half, half), 1e-12)
+        along = jnp.clip(dot(offset, half) / square, -1, 1)
+        offset = each(lambda o, h, along=along: o - along * h, offset, half)
+    return offset
+
+
+def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eigen-decomposition of symmetric 3x3 matrices by Jacobi rotations, in the batch's lanes.
+
+    (LAPACK and cuSOLVER take the matrices one by one: 160 ms for 40,000 of them on two cores,
+    where this takes 10.)
+
+    Args:
+        spread: (..., 3, 3) symmetric, positive semi-definite.
+
+    Returns:
+        deviation: (..., 3) square roots of the eigenvalues, descending.
+        direction: (..., 3, 3) unit eigenvectors as rows, in the same order.
+    """
+    a = {(i, j): spread[..., i, j] for i in range(3) for j in range(i, 3)}
+    one, zero = jnp.ones_like(spread[..., 0, 0]), jnp.zeros_like(spread[..., 0, 0])
+    v = [[one if i == j else zero for j in range(3)] for i in range(3)]  # v[k]: k-th eigenvector
+    for _ in range(_JACOBI_SWEEPS):
+        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            off = a[p, q]
+            gap = a[q, q] - a[p, p]
+            # t = tan of the angle that makes a[p, q] zero, the smaller of the two.
+            safe = jnp.where(off == 0, one, off)
+            theta = jnp.clip(0.5 * gap / safe, -1e15, 1e15)
+            sign = jnp.where(theta < 0, -one, one)
+            t = jnp.where(off == 0, zero, sign / (jnp.abs(theta) + jnp.sqrt(theta * theta + 1)))
+            c = 1 / jnp.sqrt(t * t + 1)
+            s = t * c
+            pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
+            a[pr], a[qr] = c * a[pr] - s * a[qr], s * a[pr] + c * a[qr]
+            a[p, p], a[q, q] = a[p, p] - t * off, a[q, q] + t * off
+            a[p, q] = zero
+            for k in range(3):
+                v[p][k], v[q][k] = c * v[p][k] - s * v[q][k], s * v[p][k] + c * v[q][k]
+    value = jnp.stack([a[0, 0], a[1, 1], a[2, 2]], axis=-1)
+    vector = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
+    order = jnp.argsort(-value, axis=-1)
+    deviation = jnp.sqrt(jnp.maximum(jnp.take_along_axis(value, order, axis=-1), 0))
+    return deviation, jnp.take_along_axis(vector, order[..., None], axis=-2)

@@ -1,0 +1,1 @@
+"""Updates: one cloud is fused into the map, stage by stage."""

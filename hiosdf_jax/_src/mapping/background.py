@@ -1,0 +1,137 @@
+"""Mapping in a thread of its own, while a controller plans on the newest snapshot."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import jax
+
+from hiosdf_jax._src.field.points import field_of
+from hiosdf_jax._src.mapping.pipeline import update
+from hiosdf_jax._src.state import Field, MapState
+
+
+class BackgroundMapper:
+    """Updates a map in a thread; `field` is always the newest finished one.
+
+    One frame waits while another is fused; a newer one takes its place, so that a slow machine
+    maps fewer frames instead of old ones. Use it in a `with` block, or call `close`.
+
+    Attributes:
+        field: What to plan on: the newest snapshot, with the stamp of its frame. Reading it never
+            waits.
+        dropped: Frames that gave way to newer ones.
+        rejected: Frames that `update` refused, the last reason in `rejection`.
+        rejection: The last such ValueError, or None.
+    """
+
+    def __init__(self, state: MapState) -> None:
+        """Starts the thread.
+
+        Args:
+            state: The map so far, from `init`, `load` or another mapper; not to be donated
+                afterwards.
+        """
+        self.field: Field = field_of(state)
+        self.dropped = 0
+        self.rejected = 0
+        self.rejection: ValueError | None = None
+        self._state = state
+        self._waiting: tuple[Any, Any, float] | None = None
+        self._busy = False
+        self._closed = False
+        self._failure: BaseException | None = None
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="hiosdf_jax", daemon=True)
+        self._thread.start()
+
+    def put(self, cloud: Any, pose: Any, stamp: float = 0.0) -> None:
+        """Hands a frame over and returns at once.
+
+        Args:
+            cloud: As for `update`; not to be changed by the caller afterwards.
+            pose: As for `update`.
+            stamp: When the frame was taken, s on the caller's clock, counted from a start.
+
+        Raises:
+            RuntimeError: The mapper is closed, or its thread has failed.
+        """
+        with self._changed:
+            self._check()
+            if self._closed:
+                raise RuntimeError("the BackgroundMapper is closed")
+            self.dropped += self._waiting is not None
+            self._waiting = (cloud, pose, stamp)
+            self._changed.notify_all()
+
+    def wait(self) -> MapState:
+        """Waits until every frame that was handed over is fused or dropped.
+
+        Returns:
+            The map. It shares memory with `field`: do not donate it while that is in use.
+
+        Raises:
+            RuntimeError: The mapper's thread has failed.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._failure is not None or (self._waiting is None and not self._busy)
+            )
+            self._check()
+            return self._state
+
+    def close(self) -> MapState:
+        """Fuses what waits, ends the thread and returns the map, as `wait`.
+
+        Raises:
+            RuntimeError: The mapper's thread has failed.
+        """
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+        self._check()
+        return self._state
+
+    def __enter__(self) -> BackgroundMapper:
+        """Returns the mapper itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Closes it."""
+        self.close()
+
+    def _work(self) -> None:
+        try:
+            while (frame := self._next()) is not None:
+                self._fuse(*frame)
+        except BaseException as failure:
+            with self._changed:
+                self._failure = failure
+                self._changed.notify_all()
+
+    def _next(self) -> tuple[Any, Any, float] | None:
+        with self._changed:
+            self._busy = False
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._waiting is not None or self._closed)
+            frame, self._waiting = self._waiting, None
+            self._busy = frame is not None
+            return frame
+
+    def _fuse(self, cloud: Any, pose: Any, stamp: float) -> None:
+        try:
+            # Finished before it is shown: nobody is to wait for the device in its place. The old
+            # state is not donated, so that the old field stays valid without a copy.
+            state = jax.block_until_ready(update(self._state, cloud, pose))
+        except ValueError as reason:
+            self.rejected += 1
+            self.rejection = reason
+            return
+        self._state = state
+        self.field = field_of(state).replace(stamp=jax.numpy.float32(stamp))
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise RuntimeError("the BackgroundMapper's thread has failed") from self._failure

@@ -1,0 +1,126 @@
+"""Saving a map to one file and loading it again: a resumed run goes on bit by bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import uuid
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.mapping.pipeline import init
+from hiosdf_jax._src.state import MapState
+
+_FORMAT = "hiosdf_jax map"
+_VERSION = 2
+
+# What numpy and zipfile raise for files that are damaged, or no archives.
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, KeyError)
+
+
+def save(path: str | os.PathLike[str], state: MapState) -> None:
+    """Writes the whole map to one compressed .npz file, without pickle.
+
+    The file is written aside and renamed, so that a crash leaves the old one as it was.
+
+    Args:
+        path: The file; its folder must exist.
+        state: The map.
+
+    Raises:
+        ValueError: `state` is not a map.
+        FileNotFoundError: There is no such folder.
+    """
+    if not isinstance(state, MapState):
+        raise ValueError(f"state is {type(state).__name__}, expected a MapState")
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "no such folder", str(path.parent))
+    header = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "config": dataclasses.asdict(state.config),
+        "key": str(jax.random.key_impl(state.key)),
+    }
+    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(_without_key(state)).items()}
+    arrays["header"] = np.asarray(json.dumps(header))
+    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        with aside.open("xb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+
+
+def load(path: str | os.PathLike[str]) -> MapState:
+    """Reads a map that `save` wrote.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The map, as it was.
+
+    Raises:
+        ValueError: The file is not a map, is damaged, or is of a newer version; the message names
+            the file and what is wrong with it.
+        FileNotFoundError: There is no such file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise
+    except _UNREADABLE as error:
+        # Of other files numpy says that they might be pickles, and how to load those.
+        reason = "it is none" if "pickle" in str(error) else error
+        raise ValueError(f"{path} is not a readable .npz file: {reason}") from error
+    try:
+        header = json.loads(str(arrays.pop("header")))
+        if header["format"] != _FORMAT:
+            raise KeyError
+        version, fields, key_impl = header["version"], header["config"], header["key"]
+    except (KeyError, TypeError, json.JSONDecodeError):
+        raise ValueError(f"{path} is not a hiosdf_jax map: it has no such header") from None
+    if version != _VERSION:
+        raise ValueError(f"{path} has format version {version}, expected {_VERSION}")
+    try:
+        config = Config(**fields)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} has no valid configuration: {error}") from error
+    template = jax.eval_shape(lambda: _without_key(init(config, jax.random.key(0, impl=key_impl))))
+    expected = _named_leaves(template)
+    for name, leaf in expected.items():
+        if name not in arrays:
+            raise ValueError(f"{path} lacks the array {name}")
+        if arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
+            raise ValueError(
+                f"{path} has {name} of {arrays[name].dtype} {arrays[name].shape}, "
+                f"expected {leaf.dtype} {leaf.shape}"
+            )
+    leaves = [jnp.asarray(arrays[name]) for name in expected]
+    state = jax.tree.unflatten(jax.tree.structure(template), leaves)
+    return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))
+
+
+def _without_key(state: MapState) -> MapState:
+    """The map with its typed key as plain numbers, which a file can hold."""
+    return state.replace(key=jax.random.key_data(state.key))
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

@@ -1,0 +1,83 @@
+"""Clouds and poses as a robot gives them: checked, and made to fit the compiled update."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+
+from hiosdf_jax._src.numerics.rigid import is_rigid
+
+_HASHED_EVERY = 64  # row of a cloud
+
+
+def check_shapes(cloud: Any, pose: Any) -> None:
+    """Checks what is known of tracers as well.
+
+    Args:
+        cloud: (N, 3).
+        pose: (4, 4).
+
+    Raises:
+        ValueError: A shape is wrong.
+    """
+    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
+        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
+    if np.shape(pose) != (4, 4):
+        raise ValueError(f"pose has shape {np.shape(pose)}, expected (4, 4)")
+
+
+def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Checks the values of a cloud and its pose, and gives the cloud the shape of all others.
+
+    Args:
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
+        pose: (4, 4) T_world_sensor.
+        capacity: Rows to pad with NaN to, or to draw from the finite rows.
+
+    Returns:
+        The cloud (capacity, 3) and the pose, float32.
+
+    Raises:
+        ValueError: The pose is not finite or not rigid, or the cloud has no finite row.
+    """
+    cloud, pose = np.asarray(cloud, np.float32), np.asarray(pose, np.float32)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
+    if not is_rigid(pose, np):
+        raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
+    x, y, z = cloud.T  # column by column: many times faster than all(axis=1)
+    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    if not finite.any():
+        raise ValueError(
+            f"cloud has no finite row among its {len(cloud)}, expected at least one return"
+        )
+    padded = np.empty((capacity, 3), np.float32)
+    count = len(cloud)
+    if count <= capacity:
+        padded[:count] = cloud
+    else:
+        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
+        seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), zlib.crc32(pose.tobytes()))
+        rows = _draw(finite, seed, capacity)
+        count = len(rows)
+        np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" takes a copy more
+    padded[count:] = np.nan
+    return padded, pose
+
+
+def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:
+    """Indices of `capacity` of the rows that are finite, or of all if they are no more."""
+    rows = np.flatnonzero(finite)
+    dropped = len(rows) - capacity
+    if dropped <= 0:
+        return rows
+    rng = np.random.default_rng(seed)
+    # With repetitions, until enough are different: of those to keep or of those to drop, whichever
+    # are fewer. A permutation would touch every row of a large cloud.
+    fewer = min(capacity, dropped)
+    chosen = np.zeros(len(rows), bool)
+    while missing := fewer - np.count_nonzero(chosen):
+        chosen[rng.integers(len(rows), size=missing)] = True
+    return rows[np.flatnonzero(chosen if fewer == capacity else ~chosen)]

@@ -1,0 +1,1 @@
+"""The SIREN and its training (paper, sections IV-A and IV-D)."""

@@ -1,0 +1,227 @@
+"""The fit of the network to samples (paper, section IV-D)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.network import forward, siren, tiles
+from hiosdf_jax._src.samples.draw import Samples
+from hiosdf_jax._src.state import Network
+
+
+class Losses(NamedTuple):
+    """The two parts of the loss, before their weights.
+
+    Attributes:
+        sdf: Mean |f - s|, () m (equation 4).
+        eikonal: Mean | |grad f| - 1 |, () (equation 5).
+    """
+
+    sdf: jax.Array
+    eikonal: jax.Array
+
+
+def init_network(config: Config, key: jax.Array) -> Network:
+    """Makes an untrained network whose zero is the middle of the bounds.
+
+    Args:
+        config: The map's configuration.
+        key: Source of randomness.
+
+    Returns:
+        The network.
+    """
+    params = siren.init_params(config, key)
+    return Network(
+        params=params,
+        served=jax.tree.map(jnp.copy, params),
+        optimizer=_optimizer(config).init(params),
+        origin_world=jnp.mean(jnp.asarray(config.bounds, jnp.float32), axis=0),
+    )
+
+
+def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
+    """Computes the losses over samples, the Eikonal one over the first of them.
+
+    Args:
+        config: The map's configuration.
+        params: The network's weights.
+        points: (N, 3) the samples' points relative to the network's origin, m.
+        samples: The samples.
+
+    Returns:
+        Their means over the samples with weight.
+    """
+    return _means(_sums(config, params, points, samples), _weights(config, samples))
+
+
+def least_epochs(config: Config) -> int:
+    """Epochs that every update makes, be it one of the warm-up or not."""
+    return min(config.epochs, config.warmup_epochs)
+
+
+def train(
+    config: Config,
+    network: Network,
+    samples: Samples,
+    extra_epochs: jax.Array,
+    average: jax.Array,
+    key: jax.Array,
+) -> tuple[Network, Losses, jax.Array]:
+    """Continues training, and averages the weights that are served.
+
+    Args:
+        config: The map's configuration.
+        network: The network so far.
+        samples: What to fit.
+        extra_epochs: () int32 times to go through the samples beyond `least_epochs`.
+        average: () share of the old weights in those that are served.
+        key: Source of randomness, for the order of the samples.
+
+    Returns:
+        The network, the mean losses of the last epoch, and whether all is finite; if not, the
+        network is as it was.
+    """
+    optimizer = _optimizer(config)
+    batches = _split(config, samples, key)
+
+    def objective(params: Any, tile: Samples, weights: Losses) -> tuple[jax.Array, Losses]:
+        points = tile.points_world - network.origin_world
+        sums = _sums(config, params, points, tile)
+        parts = _means(sums, weights)
+        loss = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
+        # A sum instead of a mean: single samples' shares of it would vanish in float16.
+        return loss * _count(weights), sums
+
+    def step(carry: tuple[Any, Any], batch: Samples) -> tuple[tuple[Any, Any], Losses]:
+        params, state = carry
+        weights = _weights(config, batch)
+
+        def add(total: tuple[Any, Losses], tile: Samples) -> tuple[tuple[Any, Losses], None]:
+            part = jax.grad(objective, has_aux=True)(params, tile, weights)
+            return jax.tree.map(jnp.add, total, part), None
+
+        nothing = jax.tree.map(jnp.zeros_like, (params, weights))
+        (gradients, sums), _ = jax.lax.scan(add, nothing, batch)
+        gradients = jax.tree.map(lambda gradient: gradient / _count(weights), gradients)
+        updates, state = optimizer.update(gradients, state, params)
+        return (optax.apply_updates(params, updates), state), _means(sums, weights)
+
+    def epoch(number: jax.Array, carry: tuple[Any, Any, Losses]) -> tuple[Any, Any, Losses]:
+        (params, state), parts = jax.lax.scan(step, carry[:2], _turn(config, batches, number))
+        return params, state, jax.tree.map(jnp.mean, parts)
+
+    start = (network.params, network.optimizer, Losses(jnp.float32(0), jnp.float32(0)))
+    least = least_epochs(config)
+    if jax.default_backend() == "cpu":
+        params, state, parts = jax.lax.fori_loop(0, least + extra_epochs, epoch, start)
+    else:
+        # A GPU waits for the host at each turn of a loop whose length is not known before, and
+        # `update` returns only after the last such turn.
+        extra = jax.lax.fori_loop(0, extra_epochs, epoch, start)
+        params, state, parts = jax.lax.fori_loop(
+            0, least, lambda number, carry: epoch(extra_epochs + number, carry), extra
+        )
+
+    finite = jnp.isfinite(parts.sdf + parts.eikonal) & jnp.all(
+        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(params)])
+    )
+    served = jax.tree.map(
+        lambda old, new: average * old + (1 - average) * new, network.served, params
+    )
+    points = samples.points_world - network.origin_world
+    residual = siren.predict(config, served, points) - samples.sdf
+    served = siren.shift_output(config, served, -_median(residual, samples.weight))
+    trained = network.replace(params=params, served=served, optimizer=state)
+    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), trained, network)
+    return kept, parts, finite
+
+
+def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
+    """Deals samples to (batches, tiles, size) parts; what does not fill a batch is left out.
+
+    The `eikonal_every` groups of a tile, those whose slopes count in turn, lie one after another.
+    """
+    count = samples.sdf.shape[0]
+    size = count // config.batches
+    dealt = tiles.tile_index(size, config.eikonal_every)
+    groups = np.arange(dealt.shape[1]) % config.eikonal_every
+    dealt = dealt[:, np.argsort(groups, kind="stable")]
+    order = _order(config, count, key)[: size * config.batches].reshape(config.batches, size)
+    batches = jax.tree.map(lambda array: array[order[:, np.minimum(dealt, size - 1)]], samples)
+    return batches._replace(weight=jnp.where(dealt < size, batches.weight, 0))
+
+
+def _order(config: Config, count: int, key: jax.Array) -> jax.Array:
+    """Shuffles what goes to several batches, or groups."""
+    if config.batches > 1:
+        return jax.random.permutation(key, count)
+    if config.eikonal_every > 1:
+        # The samples themselves are drawn anew at every update: the same order will do. It must
+        # only not be their own, in which each n-th sample of a ray is at the same of its depths.
+        return jnp.asarray(np.random.default_rng(0).permutation(count))
+    return jnp.arange(count)
+
+
+def _turn(config: Config, batches: Samples, epoch: jax.Array) -> Samples:
+    """Moves each tile on to its next group in every epoch: the slopes of the first one count.
+
+    Were it the same group in all epochs of an update, the network would fit its slopes alone.
+    """
+    if config.eikonal_every == 1:
+        return batches
+    size, sloped = batches.weight.shape[2], _sloped(config, batches)
+    turns = size // math.gcd(size, sloped)  # after so many all is where it was
+    places = -(epoch % turns) * sloped
+    return jax.tree.map(lambda array: jnp.roll(array, places, axis=2), batches)
+
+
+def _sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
+    """The losses times what `_weights` returns."""
+    sloped = _sloped(config, samples)
+    value, gradient = forward.value_and_gradient(config.frequency, params, points[:sloped])
+    if sloped < points.shape[0]:
+        others = forward.value(config.frequency, params, points[sloped:])
+        value = jnp.concatenate([value, others])
+    # Not a safe norm: where the gradient is 0 its direction is undefined anyway, and 1e-12 is
+    # enough to keep the derivative finite.
+    slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + 1e-12)
+    return Losses(
+        jnp.sum(jnp.abs(value - samples.sdf) * samples.weight),
+        jnp.sum(jnp.abs(slope - 1) * samples.weight[:sloped]),
+    )
+
+
+def _weights(config: Config, samples: Samples) -> Losses:
+    """Sums of the weights of all (..., N) samples, and of those whose slope counts."""
+    sloped = samples.weight[..., : _sloped(config, samples)]
+    return Losses(jnp.sum(samples.weight), jnp.sum(sloped))
+
+
+def _sloped(config: Config, samples: Samples) -> int:
+    return -(-samples.weight.shape[-1] // config.eikonal_every)
+
+
+def _means(sums: Losses, weights: Losses) -> Losses:
+    return jax.tree.map(lambda total, weight: total / jnp.maximum(weight, 1), sums, weights)
+
+
+def _count(weights: Losses) -> jax.Array:
+    return jnp.maximum(weights.sdf, 1)
+
+
+def _median(values: jax.Array, weight: jax.Array) -> jax.Array:
+    """Median of the values with weight; 0 if there are none."""
+    median = jnp.nanmedian(jnp.where(weight > 0, values, jnp.nan))
+    return jnp.where(jnp.any(weight > 0), median, 0)
+
+
+def _optimizer(config: Config) -> optax.GradientTransformation:
+    return optax.adamw(config.learning_rate, weight_decay=config.weight_decay)

@@ -1,0 +1,1 @@
+"""Gradients of batches, vectors as components, and rigid poses."""

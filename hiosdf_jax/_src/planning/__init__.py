@@ -1,0 +1,1 @@
+"""Clearances and costs for controllers."""

@@ -1,0 +1,162 @@
+"""The map as barrier of a `cbfpy` control barrier function: a filter for velocity commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import cbfpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.field.points import AnyField, Unknown, sdf
+from hiosdf_jax._src.state import Baked
+
+Spheres = Callable[[jax.Array], tuple[jax.Array, Any]]
+"""Configuration (n,) -> the body as centers_world (S, 3) m and radii (S,) m."""
+
+_PENALTY = 100.0
+_TOLERANCE = 1e-3
+
+
+def velocity_filter(
+    spheres: Spheres,
+    velocity_limits: Any,
+    *,
+    margin_m: float,
+    gain_per_s: float = 5.0,
+    unknown: Unknown = "obstacle",
+) -> Callable[[AnyField, jax.Array, jax.Array], jax.Array]:
+    """Makes a filter that changes velocity commands as little as keeps the body off the map.
+
+    With h_i = sdf(center_i) - radius_i - margin for every sphere i of the body, it answers the
+    velocity nearest to the desired one, in units of the limits, among those within the limits for
+    which d(h_i)/dt >= -gain h_i. Where there is none it violates them as little as it can, and
+    where the solver fails it stops. The answer is good to 3 % of the limits (float32).
+
+    A sphere sees the surface nearest to its center alone, so that in a corner the filter would obey
+    one wall at a time: describe a thick body by several spheres, as `inscribed` does.
+
+    Args:
+        spheres: The body at a configuration, a pure function of JAX arrays.
+        velocity_limits: (n,) > 0, the largest |velocity| of each coordinate, m/s or rad/s.
+        margin_m: Clearance to keep. Commands are held for a time dt: what a sphere travels in dt
+            belongs into the margin, and so does the map's error.
+        gain_per_s: The clearance beyond the margin shrinks by at most this share a second; keep it
+            well below 1 / dt.
+        unknown: What to make of space that no ray has reached, as for `sdf`.
+
+    Returns:
+        The pure function (field, q (n,), desired velocity (n,)) -> velocity (n,). The map is a
+        traced argument; vmap it over q for many robots.
+
+    Raises:
+        ValueError: A number is not what it should be.
+    """
+    limits = np.asarray(velocity_limits, float)
+    if limits.ndim != 1 or not (np.isfinite(limits).all() and (limits > 0).all()):
+        raise ValueError(f"velocity_limits is {velocity_limits!r}, expected (n,) numbers > 0")
+    if not (math.isfinite(margin_m) and margin_m >= 0):
+        raise ValueError(f"margin_m is {margin_m!r}, expected >= 0")
+    if not (math.isfinite(gain_per_s) and gain_per_s > 0):
+        raise ValueError(f"gain_per_s is {gain_per_s!r}, expected > 0")
+    cbf = cbfpy.CBF.from_config(_Shares(spheres, limits, margin_m, gain_per_s, unknown))
+
+    def filtered(field: AnyField, q: jax.Array, desired: jax.Array) -> jax.Array:
+        shares = cbf.safety_filter(q, desired / limits, field)
+        # A robot that obeys velocities is safe where it stands.
+        shares = jnp.where(jnp.isfinite(shares).all(), jnp.clip(shares, -1, 1), 0)
+        return shares * limits
+
+    return filtered
+
+
+def inscribed(centers: Any, radii: Any, share: float = 0.5) -> tuple[jax.Array, jax.Array]:
+    """Adds to each sphere six smaller ones that touch it from inside, along +-x, +-y and +-z.
+
+    They add nothing to the body, but each sees the surface on its own side.
+
+    Args:
+        centers: (S, 3) m.
+        radii: (S,) m.
+        share: Radius of the smaller ones, as a share of the sphere's, in (0, 1).
+
+    Returns:
+        centers (7 S, 3) m and radii (7 S,) m; the given ones come first.
+
+    Raises:
+        ValueError: share is out of range.
+    """
+    if not 0 < share < 1:
+        raise ValueError(f"share is {share!r}, expected 0 < share < 1")
+    centers = jnp.asarray(centers, jnp.float32)
+    radii = jnp.broadcast_to(jnp.asarray(radii, jnp.float32), centers.shape[:1])
+    axes = jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
+    inner = centers + (1 - share) * radii[:, None] * axes[:, None, :]
+    return (
+        jnp.concatenate([centers, inner.reshape(-1, 3)]),
+        jnp.concatenate([radii, jnp.tile(share * radii, 6)]),
+    )
+
+
+class _Shares(cbfpy.CBFConfig):
+    """dq/dt = limits * u, the dynamics of a robot whose own controllers track velocities."""
+
+    def __init__(
+        self,
+        spheres: Spheres,
+        limits: np.ndarray,
+        margin_m: float,
+        gain_per_s: float,
+        unknown: Unknown,
+    ) -> None:
+        self._limits, self._gain_per_s = limits, gain_per_s
+        count = len(limits)
+
+        # cbfpy's checks call it eagerly several times, which takes seconds without jit.
+        @jax.jit
+        def barriers(z: jax.Array, field: AnyField) -> jax.Array:
+            centers_world, radii = spheres(z)
+            return sdf(field, centers_world, unknown) - jnp.asarray(radii, jnp.float32) - margin_m
+
+        self._barriers = barriers
+        super().__init__(
+            count,
+            count,
+            u_min=-np.ones(count),
+            u_max=np.ones(count),
+            # cbfpy's own penalties and tolerances are too far apart for float32, and give NaN.
+            cbf_relaxation_penalty=_PENALTY,
+            control_relaxation_penalty=_PENALTY,
+            solver_tol=_TOLERANCE,
+            # cbfpy keeps the arguments of its checks for good: the least map that will do.
+            init_args=(_smallest(),),
+        )
+
+    def f(self, z: jax.Array, field: AnyField) -> jax.Array:
+        return jnp.zeros(self.n)
+
+    def g(self, z: jax.Array, field: AnyField) -> jax.Array:
+        return jnp.diag(jnp.asarray(self._limits))
+
+    def h_1(self, z: jax.Array, field: AnyField) -> jax.Array:
+        return self._barriers(z, field)
+
+    def alpha(self, h: jax.Array, field: AnyField) -> jax.Array:
+        return self._gain_per_s * h
+
+
+def _smallest() -> Baked:
+    """A slope along (1, 1, 1), so that cbfpy's check finds that the control matters."""
+    slope = jnp.indices((2, 2, 2)).sum(0).astype(jnp.float32)
+    return Baked(
+        corner_world=jnp.zeros(3),
+        resolution=jnp.ones(()),
+        sdf=slope,
+        frontier=slope,
+        lower=slope,
+        updates=jnp.zeros((), jnp.int32),
+        stamp=jnp.zeros(()),
+    )

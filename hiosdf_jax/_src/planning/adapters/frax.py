@@ -1,0 +1,99 @@
+"""Whole-arm clearance of a manipulator of `frax`, whose links carry collision spheres."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.numerics.gradient import least, value_and_gradient
+from hiosdf_jax._src.planning.clearance import sphere_clearance
+
+if TYPE_CHECKING:
+    from frax import Manipulator
+
+
+def arm_spheres(
+    arm: Manipulator, q: Any, pose_world_base: Any = None
+) -> tuple[jax.Array, jax.Array]:
+    """Places the collision spheres of an arm's moving links.
+
+    Those of its base are left out: they cannot move, and would always touch what it stands on.
+
+    Args:
+        arm: A robot of frax with collision data, such as `frax.load_panda()`; static under jit.
+        q: (..., n) joint positions, rad or m.
+        pose_world_base: (4, 4) T_world_base, m; the identity if None.
+
+    Returns:
+        centers_world (..., S, 3) m and radii (S,) m.
+
+    Raises:
+        ValueError: An argument is not what it should be.
+    """
+    q = jnp.asarray(q, jnp.float32)
+    if not arm.has_collision_data:
+        raise ValueError("arm has no collision data, expected the spheres of its links")
+    if q.ndim == 0 or q.shape[-1] != arm.nq:
+        raise ValueError(f"q has shape {q.shape}, expected (..., {arm.nq})")
+    pose = jnp.eye(4) if pose_world_base is None else jnp.asarray(pose_world_base)
+    if pose.shape != (4, 4):
+        raise ValueError(f"pose_world_base has shape {pose.shape}, expected (4, 4)")
+    flat = jax.vmap(arm.link_collision_positions)(q.reshape(-1, arm.nq))
+    centers_base = flat.reshape(*q.shape[:-1], -1, 3)
+    centers_world = jnp.einsum("ij,...j->...i", pose[:3, :3], centers_base) + pose[:3, 3]
+    return centers_world, jnp.asarray(arm.flat_collision_radii, jnp.float32)
+
+
+def arm_clearance(
+    field: AnyField,
+    arm: Manipulator,
+    q: Any,
+    pose_world_base: Any = None,
+    unknown: Unknown = "network",
+) -> jax.Array:
+    """Distance between the map and the nearest of an arm's moving links.
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        arm: As for `arm_spheres`.
+        q: (..., n) joint positions, rad or m.
+        pose_world_base: (4, 4) T_world_base, m; the identity if None.
+        unknown: What to make of space that no ray has reached, as for `sdf`.
+
+    Returns:
+        (...) float32, m: the least of sdf(center) - radius; negative in collision. Differentiable.
+
+    Raises:
+        ValueError: An argument is not what it should be.
+    """
+    centers_world, radii = arm_spheres(arm, q, pose_world_base)
+    return least(sphere_clearance(field, centers_world, radii, unknown))
+
+
+def arm_clearance_and_grad(
+    field: AnyField,
+    arm: Manipulator,
+    q: Any,
+    pose_world_base: Any = None,
+    unknown: Unknown = "network",
+) -> tuple[jax.Array, jax.Array]:
+    """The same and its gradient by the joints, by one backward pass for the whole batch.
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        arm: As for `arm_spheres`.
+        q: (..., n) joint positions, rad or m.
+        pose_world_base: (4, 4) T_world_base, m; the identity if None.
+        unknown: What to make of space that no ray has reached, as for `sdf`.
+
+    Returns:
+        The clearance (...) float32, m, and d(clearance)/dq (..., n) float32, m/rad or 1.
+
+    Raises:
+        ValueError: An argument is not what it should be.
+    """
+    q = jnp.asarray(q, jnp.float32)
+    return value_and_gradient(lambda q: arm_clearance(field, arm, q, pose_world_base, unknown), q)

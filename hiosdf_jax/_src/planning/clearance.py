@@ -1,0 +1,91 @@
+"""How far spheres are from collision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.field.points import AnyField, Unknown, sdf, sdf_and_grad
+
+
+def sphere_clearance(
+    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "network"
+) -> jax.Array:
+    """Signed distance of spheres to the nearest surface: sdf(center) - radius.
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        centers_world: (..., 3) m.
+        radii: m, >= 0; any shape that broadcasts to that of the spheres, (...).
+        unknown: As for `sdf`.
+
+    Returns:
+        (...) float32, m; negative by the depth of the penetration. Differentiable.
+
+    Raises:
+        ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
+    """
+    radii = checked_radii(radii, centers_world, "centers_world")
+    return sdf(field, centers_world, unknown) - radii
+
+
+def sphere_clearance_and_grad(
+    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "network"
+) -> tuple[jax.Array, jax.Array]:
+    """Clearance of spheres and its gradient, by one backward pass for the whole batch.
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        centers_world: (..., 3) m.
+        radii: As for `sphere_clearance`.
+        unknown: As for `sdf`.
+
+    Returns:
+        The clearance (...) float32, m, and d(clearance)/d(center), (..., 3) float32.
+
+    Raises:
+        ValueError: As for `sphere_clearance`.
+    """
+    radii = checked_radii(radii, centers_world, "centers_world")
+    value, gradient = sdf_and_grad(field, centers_world, unknown)
+    return value - radii, gradient
+
+
+def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
+    """Checks radii against the centers of their spheres.
+
+    Args:
+        radii: m.
+        centers: (..., 3) m.
+        name: What the caller calls the centers.
+
+    Returns:
+        The radii, float32.
+
+    Raises:
+        ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
+    """
+    shape = np.shape(centers)
+    if not shape or shape[-1] != 3:
+        raise ValueError(f"{name} has shape {shape}, expected (..., 3)")
+    if not isinstance(radii, jax.core.Tracer):
+        values = np.asarray(radii, float)
+        wrong = ~((values >= 0) & np.isfinite(values))
+        if wrong.any():
+            raise ValueError(
+                f"radii has {wrong.sum()} negative or not finite values, expected all >= 0: "
+                f"{values[wrong][:5].tolist()} at {np.argwhere(wrong)[:5].tolist()}"
+            )
+    radii = jnp.asarray(radii, jnp.float32)
+    # Radii that enlarge the batch are a mistake: each sphere has one.
+    dimensions = zip(radii.shape[::-1], shape[-2::-1], strict=False)
+    if radii.ndim >= len(shape) or any(own not in (1, batch) for own, batch in dimensions):
+        raise ValueError(
+            f"radii has shape {radii.shape}, expected one that broadcasts to {shape[:-1]}, "
+            f"the spheres of {name}"
+        )
+    return radii

@@ -1,0 +1,122 @@
+"""Signed distances, or bounds of them, of the solids that geoms describe, in their own frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hiosdf_jax._src.planning.robot.cover import SignedDistance
+
+# How far the search for the nearest point of a mesh may err, as a share of the distance.
+_SEARCH = 0.01
+
+# Nodes of the lattice that tells a mesh's inside, if half the tolerance is fine enough for that.
+_MOST_NODES = 3_000_000
+
+
+def cylinder(radius: float, half_length: float) -> SignedDistance:
+    """A cylinder along z.
+
+    Args:
+        radius: m.
+        half_length: m.
+
+    Returns:
+        Its signed distance; both bounds are exact.
+    """
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        radial = np.hypot(points[:, 0], points[:, 1]) - radius
+        beyond = np.stack([radial, np.abs(points[:, 2]) - half_length], axis=1)
+        value = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+        return value, value
+
+    return distance
+
+
+def ellipsoid(semi_axes: np.ndarray) -> SignedDistance:
+    """An ellipsoid.
+
+    Args:
+        semi_axes: (3,) m.
+
+    Returns:
+        Its signed distance; both bounds are exact to 1e-6 of the largest axis.
+    """
+    squares = semi_axes**2
+    least = squares.min()
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # The nearest point is r_k^2 p_k / (t + r_k^2) with the t > -min r^2 that puts it on the
+        # surface. Off the planes of symmetry the root exists and is the only one.
+        p = np.maximum(np.abs(points), 1e-9 * semi_axes.max())
+        low = np.full(len(p), -least)
+        high = np.linalg.norm(semi_axes * p, axis=1)
+        for _ in range(80):
+            middle = (low + high) / 2
+            with np.errstate(divide="ignore"):
+                ratio = np.sum((semi_axes * p / (middle[:, None] + squares)) ** 2, axis=1)
+            low, high = np.where(ratio > 1, middle, low), np.where(ratio > 1, high, middle)
+        nearest = squares * p / np.maximum(high[:, None] + squares, 1e-300)
+        value = np.linalg.norm(p - nearest, axis=1) * np.where(high > 0, 1, -1)
+        return value, value
+
+    return distance
+
+
+def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> SignedDistance:
+    """A triangle mesh and all that it encloses; an open one is a sheet.
+
+    Hollows count as enclosed where only gaps narrower than half the tolerance lead to them.
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3) indices.
+        tolerance: What the bounds are needed for, m.
+
+    Returns:
+        Its signed distance; the bounds are some tenths of the tolerance apart.
+    """
+    # Imported here: a robot that loads its spheres from a file needs neither.
+    import trimesh
+    from scipy import ndimage
+    from scipy.spatial import KDTree
+
+    # Each point of a triangle is within its longest edge / sqrt(3) of one of its corners.
+    edge = tolerance / 10
+    longest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max()
+    rounds = int(np.ceil(np.log2(max(longest / edge, 1)))) + 2
+    fine = trimesh.remesh.subdivide_to_size(vertices, faces, edge, max_iter=rounds)[0]
+    error = edge / np.sqrt(3)
+    tree = KDTree(fine)
+
+    # Which side: neighbours on a lattice are on the same one if the surface is farther from one of
+    # them than half their distance; what is not connected to the outside is enclosed.
+    extents = fine.max(axis=0) - fine.min(axis=0)
+    affordable = (np.prod(extents + tolerance) / _MOST_NODES) ** (1 / 3)
+    pitch = float(np.clip(affordable, tolerance / 10, tolerance / 2))
+    corner = fine.min(axis=0) - 3 * pitch
+    counts = np.ceil((fine.max(axis=0) - corner) / pitch).astype(int) + 4
+    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
+    nodes = corner + pitch * index.reshape(-1, 3)
+    gap = np.asarray(tree.query(nodes, distance_upper_bound=2 * pitch)[0]).reshape(counts) - error
+    labelled: Any = ndimage.label(gap > pitch / 2)
+    regions = np.asarray(labelled[0])
+    enclosed = (regions != regions[0, 0, 0]) & (regions > 0)
+    outside = regions == regions[0, 0, 0]
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # Approximate, since exact searches from deep inside take long.
+        far = np.asarray(tree.query(points, eps=_SEARCH)[0])
+        near = np.maximum(far / (1 + _SEARCH) - error, 0)
+        node = np.rint((points - corner) / pitch).astype(int)
+        within = np.all((node >= 0) & (node < counts), axis=1)
+        x, y, z = np.where(within[:, None], node, 0).T
+        # The node tells the point's side if the surface is farther than the node.
+        telling = np.linalg.norm(points - (corner + pitch * np.stack([x, y, z], -1)), axis=1) < near
+        is_in = within & telling & enclosed[x, y, z]
+        is_out = ~within | (telling & outside[x, y, z])
+        return np.where(is_out, near, -far), np.where(is_in, -near, far)
+
+    return distance

@@ -1,0 +1,237 @@
+"""A robot's geoms as spheres on its bodies, and where they are in a configuration."""
+
+# mujoco's bindings carry no types that pyright can see.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.numerics.gradient import least
+from hiosdf_jax._src.planning.clearance import sphere_clearance
+from hiosdf_jax._src.planning.robot import cover, solids
+
+
+class RobotSpheres(flax.struct.PyTreeNode):
+    """Spheres on the bodies of a robot; made by `spheres_from_model`.
+
+    Attributes:
+        body: The body that carries the sphere, (S,) int32.
+        centers_body: In that body's frame, (S, 3) float32, m.
+        radii: (S,) float32, m.
+    """
+
+    body: jax.Array
+    centers_body: jax.Array
+    radii: jax.Array
+
+
+class BodyPoses(NamedTuple):
+    """Where bodies are; `mjx.Data` and `mujoco.MjData` have the same two attributes.
+
+    Attributes:
+        xpos: Positions of the bodies' frames, (..., B, 3) m, world frame.
+        xmat: Rotations T_world_body, (..., B, 3, 3) or (..., B, 9), row by row.
+    """
+
+    xpos: Any
+    xmat: Any
+
+
+def spheres_from_model(
+    model: Any,
+    tolerance_m: float,
+    bodies: Iterable[int | str] | None = None,
+    geoms: Iterable[int | str] | None = None,
+) -> RobotSpheres:
+    """Covers geoms entirely by spheres that protrude at most a tolerance beyond them.
+
+    Meshes are covered as they are, with all that they enclose, not as the convex hulls that MuJoCo
+    collides. Half the tolerance means about four times the spheres. Not inside jit.
+
+    Args:
+        model: `mujoco.MjModel` or `mjx.Model`.
+        tolerance_m: How far a sphere may protrude beyond its geom, m, > 0.
+        bodies: Names or ids of the bodies whose colliding geoms (contype or conaffinity not 0)
+            are covered; without them all but the world's.
+        geoms: Names or ids of the geoms to cover, instead of `bodies`.
+
+    Returns:
+        The spheres, in the order of the geoms.
+
+    Raises:
+        ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen,
+            or one of them is a plane, a height field or an SDF; the message names it.
+    """
+    if isinstance(tolerance_m, bool) or not (math.isfinite(tolerance_m) and tolerance_m > 0):
+        raise ValueError(f"tolerance_m is {tolerance_m}, expected > 0 and finite")
+    parts = []
+    for geom in _chosen_geoms(model, bodies, geoms):
+        centers, radii = _cover_geom(model, geom, float(tolerance_m))
+        rotation = _rotation(np.asarray(model.geom_quat[geom], float))
+        centers_body = np.asarray(model.geom_pos[geom], float) + centers @ rotation.T
+        body = np.full(len(radii), model.geom_bodyid[geom])
+        parts.append((body, centers_body, radii))
+    body, centers_body, radii = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return RobotSpheres(
+        body=jnp.asarray(body, jnp.int32),
+        centers_body=jnp.asarray(centers_body, jnp.float32),
+        radii=jnp.asarray(radii, jnp.float32),
+    )
+
+
+def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
+    """Centers of a robot's spheres in a configuration.
+
+    Args:
+        spheres: The robot's spheres.
+        data: What has the bodies' poses as `xpos` and `xmat`: `mjx.Data` after `mjx.kinematics`
+            (or a step), `mujoco.MjData`, or `BodyPoses`.
+
+    Returns:
+        (..., S, 3) float32, m, world frame. Differentiable.
+
+    Raises:
+        ValueError: The poses' shapes are wrong, or there are fewer bodies than the spheres name.
+    """
+    xpos, xmat = jnp.asarray(data.xpos, jnp.float32), jnp.asarray(data.xmat, jnp.float32)
+    if xpos.ndim < 2 or xpos.shape[-1] != 3:
+        raise ValueError(f"data.xpos has shape {xpos.shape}, expected (..., B, 3)")
+    if xmat.shape not in ((*xpos.shape, 3), (*xpos.shape[:-1], 9)):
+        raise ValueError(
+            f"data.xmat has shape {xmat.shape}, expected {(*xpos.shape, 3)}, as data.xpos has "
+            f"shape {xpos.shape}"
+        )
+    if not isinstance(spheres.body, jax.core.Tracer) and spheres.body.size:
+        largest = int(np.max(np.asarray(spheres.body)))
+        if largest >= xpos.shape[-2]:
+            raise ValueError(
+                f"data has {xpos.shape[-2]} bodies, expected more than {largest}, the largest "
+                f"of spheres.body"
+            )
+    rotations = xmat.reshape(*xpos.shape, 3)[..., spheres.body, :, :]
+    # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
+    offsets_world = jnp.sum(rotations * spheres.centers_body[:, None, :], axis=-1)
+    return xpos[..., spheres.body, :] + offsets_world
+
+
+def robot_clearance(
+    field: AnyField, spheres: RobotSpheres, data: Any, unknown: Unknown = "network"
+) -> jax.Array:
+    """Least clearance of a robot's spheres in a configuration.
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        spheres: The robot's spheres.
+        data: As for `place_spheres`.
+        unknown: As for `hiosdf_jax.sdf`.
+
+    Returns:
+        (...) float32, m. Differentiable, by the joints through `mjx.kinematics`.
+
+    Raises:
+        ValueError: As for `place_spheres` and `sphere_clearance`.
+    """
+    centers_world = place_spheres(spheres, data)
+    return least(sphere_clearance(field, centers_world, spheres.radii, unknown))
+
+
+def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
+    if bodies is not None and geoms is not None:
+        raise ValueError("bodies and geoms are both given, expected one of them")
+    if geoms is not None:
+        chosen = _ids(model, geoms, "geom", model.ngeom)
+    else:
+        carriers = (
+            range(1, model.nbody) if bodies is None else _ids(model, bodies, "body", model.nbody)
+        )
+        colliding = (np.asarray(model.geom_contype) != 0) | (
+            np.asarray(model.geom_conaffinity) != 0
+        )
+        carried = np.isin(np.asarray(model.geom_bodyid), list(carriers))
+        chosen = np.nonzero(colliding & carried)[0].tolist()
+    if not chosen:
+        raise ValueError("no geom is chosen, expected bodies with colliding geoms, or geoms")
+    return sorted(set(chosen))
+
+
+def _ids(model: Any, wanted: Any, kind: str, count: int) -> list[int]:
+    if isinstance(wanted, str):
+        raise ValueError(f"{kind} names are the string {wanted!r}, expected several in a list")
+    names = [_name(model, kind, k) for k in range(count)]
+    ids = []
+    for item in wanted:
+        if isinstance(item, str):
+            if item not in names:
+                raise ValueError(f"the model has no {kind} {item!r}, expected one of {names}")
+            ids.append(names.index(item))
+        elif 0 <= item < count:
+            ids.append(int(item))
+        else:
+            raise ValueError(f"the model has no {kind} {item}, expected 0 to {count - 1}")
+    return ids
+
+
+def _name(model: Any, kind: str, index: int) -> str:
+    start = int(getattr(model, f"name_{kind}adr")[index])
+    return model.names[start : model.names.index(b"\0", start)].decode()
+
+
+def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.Spheres:
+    # Imported here: the rest of the package does without.
+    import mujoco
+
+    size = np.asarray(model.geom_size[geom], float)
+    kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return cover.cover_capsule(size[0], 0.0, tolerance)
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return cover.cover_capsule(size[0], size[1], tolerance)
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return cover.cover_box(size, tolerance)
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        half = size[[0, 0, 1]]
+        return cover.cover_solid(solids.cylinder(size[0], size[1]), -half, half, tolerance)
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return cover.cover_solid(solids.ellipsoid(size), -size, size, tolerance)
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        vertices, faces = _mesh(model, int(model.geom_dataid[geom]))
+        solid = solids.mesh(vertices, faces, tolerance)
+        return cover.cover_solid(solid, vertices.min(axis=0), vertices.max(axis=0), tolerance)
+    raise ValueError(
+        f"geom {geom} ({_name(model, 'geom', geom)!r}) is of type "
+        f"{kind.name.removeprefix('mjGEOM_').lower()}, expected sphere, capsule, box, cylinder, "
+        f"ellipsoid or mesh"
+    )
+
+
+def _mesh(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) m, in the geom's frame, and faces (F, 3) of a mesh."""
+
+    def rows(array: Any, starts: Any) -> np.ndarray:
+        last = starts[mesh + 1] if mesh + 1 < len(starts) else len(array)
+        return np.asarray(array)[starts[mesh] : last]
+
+    vertices = rows(model.mesh_vert, model.mesh_vertadr).astype(float)
+    return vertices, rows(model.mesh_face, model.mesh_faceadr)
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """The rotation matrix of (w, x, y, z)."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

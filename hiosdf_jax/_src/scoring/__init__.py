@@ -1,0 +1,1 @@
+"""Scores of a map against exact distances."""

@@ -1,0 +1,1 @@
+"""Maps as pictures, drawn without a display."""

@@ -1,6 +1,0 @@
-"""Maps as pictures, drawn without a display."""
-
-from hiosdf_jax.view.shading import save_shaded
-from hiosdf_jax.view.slices import save_slices
-
-__all__ = ["save_shaded", "save_slices"]
