@@ -9,7 +9,7 @@ import optax
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.network import siren, tiles, training
+from hiosdf_jax._src.network import forward, siren, tiles, training
 from hiosdf_jax._src.network.fast_sine import cosine, sine
 from hiosdf_jax._src.samples.draw import Samples
 
