@@ -12,8 +12,10 @@ import jax
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from room import CONFIG, HALF
 
 import hiosdf_jax as hio
+from benchmarks import records
 from benchmarks.accuracy import __main__ as command
 from benchmarks.accuracy import figure, gate, measure, results
 from hiosdf_jax import datasets
@@ -21,21 +23,7 @@ from hiosdf_jax._src.command import run
 from hiosdf_jax._src.grid.lookup import grid_sdf
 from hiosdf_jax._src.scoring import metrics
 
-HALF = np.array([1.2, 1.0, 0.8])  # of a room around the origin
 FRAMES = 8
-TINY = {
-    "near_samples": 200,
-    "far_samples": 600,
-    "local_points": 10,
-    "local_ray_samples": 4,
-    "hidden_width": 16,
-    "hidden_layers": 1,
-    "max_points": 800,
-    "epochs": 2,
-    "warmup_updates": 0,
-    "distance_horizon": 1.0,
-    "grid_share": 0.5,
-}
 
 
 def write_room(path, truth=True):
@@ -61,14 +49,17 @@ def write_room(path, truth=True):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """Config.light, smaller still."""
+    """Lets Config.light be the map of other tests, so that its update is compiled once for all."""
+    given = []
 
     def light(cls, bounds, **overrides):
-        return cls.paper(bounds, **(TINY | overrides))
+        given.append((bounds, overrides))
+        return CONFIG
 
     monkeypatch.setattr(hio.Config, "light", classmethod(light))
     monkeypatch.setattr(measure, "EARLY_FRAMES", 4)
     monkeypatch.setattr(run, "_FIRST_HELD_OUT", 5)
+    return given
 
 
 def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
@@ -84,49 +75,48 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     path = tmp_path / "room.npz"
     stream, truth = datasets.NpzStream(path), datasets.ground_truth(path)
     extent = datasets.find_bounds(stream)
-    config = hio.Config.light(extent.bounds, max_range=extent.max_range)
-    states, state = [], hio.init(config, jax.random.key(0))
+    assert tiny[-1] == (extent.bounds, {"max_range": extent.max_range})
+    states, state = [], hio.init(CONFIG, jax.random.key(0))
     order = np.random.default_rng(0)  # the seed is also that of the rows' order
     for cloud, pose in stream:
         state = hio.update(state, order.permutation(cloud), pose)
         states.append(state)
 
-    answer = jax.jit(hio.sdf_and_grad)
-
     def score(state, frame, **settings):
-        ask = functools.partial(answer, hio.snapshot(state))
+        ask = functools.partial(hio.sdf_and_grad, hio.snapshot(state))
         return metrics.evaluate(ask, truth, last_frame=frame, **settings)
 
     record, real = json.loads(output.read_text())
     assert (record["stream"], record["seed"], record["frames"]) == ("room", 0, FRAMES)
-    served = record["variants"]["served"]
+    blended = record["variants"]["blended"]
     expected = score(state, FRAMES - 1, sensor_position_world=[0.5, 0, 0])
     expected |= metrics.evaluate_lower(
-        jax.jit(lambda points: hio.query(state, points).lower), truth, FRAMES - 1
+        lambda points: hio.query(state, points).lower, truth, FRAMES - 1
     )
     expected["early_then_cm"] = score(states[3], 3)["visible_cm"]
     expected["early_now_cm"] = score(state, 3)["visible_cm"]
-    assert served["scores"] == pytest.approx(expected, rel=1e-4)
-    assert [entry["frame"] for entry in served["over_time"]] == [2, 5, 7]
+    assert blended["scores"] == pytest.approx(expected, rel=1e-4)
+    assert [entry["frame"] for entry in blended["over_time"]] == [2, 5, 7]
     first = score(states[2], 2)["visible_cm"]
-    assert served["over_time"][0]["visible_cm"] == pytest.approx(first, rel=1e-4)
-    assert served["over_time"][0]["surface_cm"] is None  # NaN, which JSON does not have
+    assert blended["over_time"][0]["visible_cm"] == pytest.approx(first, rel=1e-4)
+    assert blended["over_time"][0]["surface_cm"] is None  # NaN, which JSON does not have
     grid = record["variants"]["grid"]
-    surface = grid_sdf(config, state.grid.surface, truth.surface_points_world)
+    ask_grid = jax.jit(grid_sdf, static_argnums=0)
+    surface = ask_grid(CONFIG, state.grid.surface, truth.surface_points_world)
     mean_cm = 100 * float(np.abs(surface).mean())
     assert grid["scores"]["surface_cm"] == pytest.approx(mean_cm, rel=1e-4)
     assert grid["bands"]["5-20 cm"]["visible_cm"] < 3
     assert record["variants"]["network"]["scores"]["visible_cm"] > grid["scores"]["visible_cm"]
 
-    assert real["variants"]["served"]["scores"].keys() == {"median_cm", "mean_cm", "p90_cm"}
-    held, order = hio.init(config, jax.random.key(0)), np.random.default_rng(0)
+    assert real["variants"]["blended"]["scores"].keys() == {"median_cm", "mean_cm", "p90_cm"}
+    held, order = hio.init(CONFIG, jax.random.key(0)), np.random.default_rng(0)
     for frame in (0, 1, 2, 3, 4, 6, 7):
         cloud, pose = stream[frame]
         held = hio.update(held, order.permutation(cloud), pose)
     cloud, pose = stream[5]
     returns = cloud + pose[:3, 3]
     returns = returns[np.asarray(hio.query(held, returns).observed)]
-    error_cm = 100 * np.abs(grid_sdf(config, held.grid.surface, returns))
+    error_cm = 100 * np.abs(ask_grid(CONFIG, held.grid.surface, returns))
     assert len(returns) > 300 and np.median(error_cm) < 5
     median_cm = real["variants"]["grid"]["scores"]["median_cm"]
     assert median_cm == pytest.approx(np.median(error_cm), rel=1e-3)
@@ -135,9 +125,9 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
 
     saved = json.loads(baseline.read_text())
     assert saved["room"]["light"]["frames"] == FRAMES
-    figures = saved["room"]["light"]["figures"]["served"]
-    assert figures["visible_cm"] == [served["scores"]["visible_cm"]]
-    assert figures["eikonal 0-5 cm"] == [served["bands"]["0-5 cm"]["eikonal"]]
+    figures = saved["room"]["light"]["figures"]["blended"]
+    assert figures["visible_cm"] == [blended["scores"]["visible_cm"]]
+    assert figures["eikonal 0-5 cm"] == [blended["bands"]["0-5 cm"]["eikonal"]]
     assert "real" in saved
     assert "early_now_cm" in capsys.readouterr().out
 
@@ -146,8 +136,8 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
 
 
 def made_up(source, config_name, seed, every, overrides):
-    """What `measure` gives, with figures that tell what they are of."""
-    visible = {"grid": 0.5, "network": 2.0, "served": 1.0 + overrides.get("grid_share", 0)}
+    """What `measure` gives, with a different figure for each variant and seed."""
+    visible = {"grid": 0.5, "network": 2.0, "blended": 1.0 + overrides.get("grid_share", 0)}
     variants = {}
     for name, value in visible.items():
         scores = {"visible_cm": value + 0.01 * seed, "recall": 0.9, "surface_cm": math.nan}
@@ -162,6 +152,7 @@ def made_up(source, config_name, seed, every, overrides):
         "frames": 20,
         "device": "cpu",
         "jax": jax.__version__,
+        "revision": "abc1234",
         "variants": variants,
     }
 
@@ -175,11 +166,12 @@ def unmapped(tmp_path, monkeypatch):
 
     monkeypatch.setattr(command, "open_source", opened)
     monkeypatch.setattr(command, "measure", made_up)
+    monkeypatch.setattr(command.figure, "save_figure", lambda *_: False)  # other tests draw
     monkeypatch.chdir(tmp_path)
     return ["--data", ".", "--streams", "house_depth", "--baseline", "baseline.json"]
 
 
-def test_the_gate_tells_what_got_worse(unmapped, capsys):
+def test_the_gate_names_what_got_worse(unmapped, capsys):
     assert command.main(unmapped) == 0
     assert "house_depth light: not in the baseline" in capsys.readouterr().out
     assert not Path("baseline.json").exists()
@@ -187,13 +179,13 @@ def test_the_gate_tells_what_got_worse(unmapped, capsys):
     assert command.main([*unmapped, "--seeds", "0", "1"]) == 0
     assert "12 figures compared" in capsys.readouterr().out  # 3 variants, but not the NaN
     saved = json.loads(Path("baseline.json").read_text())
-    saved["house_depth"]["light"]["figures"]["served"]["recall"] = [0.99, 0.99]
+    saved["house_depth"]["light"]["figures"]["blended"]["recall"] = [0.99, 0.99]
     saved["house_depth"]["light"]["figures"]["grid"]["visible_cm"] = [0.9, 0.9]
     Path("baseline.json").write_text(json.dumps(saved))
     assert command.main([*unmapped, "--seeds", "0", "1"]) == 1
     out = capsys.readouterr().out
     worse = out[out.index("WORSE") :].splitlines()
-    assert worse[1] == "  house_depth light served: recall 0.990 -> 0.900 (tolerance 0.050)"
+    assert worse[1] == "  house_depth light blended: recall 0.990 -> 0.900 (tolerance 0.050)"
     assert worse[2].startswith("12 figures")
     assert "house_depth light grid: visible_cm 0.90 -> 0.51" in out[: out.index("WORSE")]
     assert json.loads(Path("baseline.json").read_text()) == saved  # only the switch changes it
@@ -205,11 +197,11 @@ def test_a_change_is_compared_with_the_configuration_as_it_is(unmapped, capsys):
     assert command.main([*unmapped, "--override", "epochs=2"]) == 0
     assert command.main([*unmapped, "--override", "grid_share=0.5"]) == 1
     out = capsys.readouterr().out
-    assert out.count("compared with the configuration as it is") == 2
+    assert out.count("compared with the unchanged ones") == 2
     assert (
         out[out.index("WORSE") :]
         .splitlines()[1]
-        .startswith("  house_depth light served: visible_cm 1.00 -> 1.50")
+        .startswith("  house_depth light blended: visible_cm 1.00 -> 1.50")
     )
 
 
@@ -217,9 +209,9 @@ def test_peers_stand_beside_whole_streams_only(unmapped, capsys):
     command.main([*unmapped, "--seeds", "0", "2"])
     lines = capsys.readouterr().out.splitlines()
     heading = next(line for line in lines if line.startswith("stream "))
-    assert heading.split()[:4] == ["stream", "map", "asked", "visible_cm"]
-    served = next(line.split() for line in lines if " served " in line)
-    assert served[:4] == ["house_depth", "light", "served", "1.01±0.01"]
+    assert heading.split()[:4] == ["stream", "map", "variant", "visible_cm"]
+    blended = next(line.split() for line in lines if " blended " in line)
+    assert blended[:4] == ["house_depth", "light", "blended", "1.01±0.01"]
     peer = next(line for line in lines if "HIO-SDF" in line)
     assert "2.97±0.1" in peer and "0.934" in peer
     near = next(line.split() for line in lines if " 0-5 cm" in line)
@@ -233,14 +225,26 @@ def test_an_ablation_is_one_table_and_has_no_gate(unmapped, capsys):
     arguments = [*unmapped, "--ablation", "grid_share", "--override", "voxel_size=0.2"]
     assert command.main(arguments) == 0
     out = capsys.readouterr().out
-    served = [line.split() for line in out.splitlines() if " served " in line]
-    rows = {row[2]: row[4] for row in served if "±" not in row[4] and row[4][0].isdigit()}
+    blended = [line.split() for line in out.splitlines() if " blended " in line]
+    rows = {row[3]: row[5] for row in blended if "±" not in row[5] and row[5][0].isdigit()}
     assert rows == {"0.0": "1.00", "0.5": "1.50", "0.8": "1.80", "0.9": "1.90", "1.0": "2.00"}
     assert out.count("visible_cm  ") >= 1 and out.count("\nstream ") == 2
     assert "not compared with the baseline" in out
-    records = json.loads(Path("hiosdf_output/accuracy.json").read_text())
+    runs = json.loads(Path("hiosdf_output/accuracy.json").read_text())
     expected = [{"voxel_size": 0.2, "grid_share": share} for share in (0.0, 0.5, 0.8, 0.9, 1.0)]
-    assert [record["overrides"] for record in records] == expected
+    assert [run["overrides"] for run in runs] == expected
+
+
+def test_figures_of_the_tables_are_written_by_configuration(unmapped, monkeypatch):
+    monkeypatch.setattr(command, "_TABLES", Path("tables.json"))
+    command.main([*unmapped, "--seeds", "0", "2", "--update-tables"])
+    command.main([*unmapped, "--override", "grid_share=0.5", "--update-tables"])
+    found = records.read(Path("tables.json"))["house_depth"]
+    assert found.keys() == {"light", "light, grid_share=0.5"}
+    assert found["light"]["seeds"] == [0, 2]
+    assert found["light"]["mean"]["grid"] == {"visible_cm": 0.51, "recall": 0.9}
+    assert found["light"]["half_range"]["grid"] == {"visible_cm": 0.01, "recall": 0.0}
+    assert found["light, grid_share=0.5"]["mean"]["blended"]["visible_cm"] == 1.5
 
 
 @pytest.mark.parametrize(
@@ -292,8 +296,8 @@ def test_tolerance():
 def compared(metric, old, new):
     record = {"stream": "s", "config_name": "c", "frames": 3}
     scores = {} if new is None else {metric: new}
-    record["variants"] = {"served": {"scores": scores, "bands": {}, "over_time": []}}
-    entry = {"frames": 3, "figures": {"served": {metric: [old]}}}
+    record["variants"] = {"blended": {"scores": scores, "bands": {}, "over_time": []}}
+    entry = {"frames": 3, "figures": {"blended": {metric: [old]}}}
     verdict = gate.compare({"s": {"c": entry}}, [record])
     return [len(lines) for lines in verdict[:3]]
 
@@ -329,7 +333,7 @@ def test_an_update_keeps_other_entries(tmp_path):
     first = [made_up(source, "light", seed, 1, {}) for seed in (0, 1)]
     gate.update_baseline(tmp_path / "b.json", first)
     gate.update_baseline(tmp_path / "b.json", [made_up(source, "paper", 5, 1, {})])
-    baseline = gate.load_baseline(tmp_path / "b.json")
+    baseline = records.read(tmp_path / "b.json")
     assert baseline["room"].keys() == {"light", "paper"}
     assert baseline["room"]["light"]["seeds"] == [0, 1]
     grid = baseline["room"]["light"]["figures"]["grid"]
@@ -344,20 +348,20 @@ def test_an_update_keeps_other_entries(tmp_path):
 def test_figures_of_seeds():
     source = measure.Source("room", None, None, None, True)
     records = [made_up(source, "light", seed, 1, {}) for seed in (0, 3)]
-    served = results.figures_of(records)["served"]
-    assert served["visible_cm"] == [1.0, 1.03]
-    assert served["visible_cm >50 cm"] == [3.0, 3.0]
+    blended = results.figures_of(records)["blended"]
+    assert blended["visible_cm"] == [1.0, 1.03]
+    assert blended["visible_cm >50 cm"] == [3.0, 3.0]
     none = copy.deepcopy(records[:1])
-    none[0]["variants"]["served"]["scores"]["visible_cm"] = None  # as read from JSON
-    assert math.isnan(results.figures_of(none)["served"]["visible_cm"][0])
+    none[0]["variants"]["blended"]["scores"]["visible_cm"] = None  # as read from JSON
+    assert math.isnan(results.figures_of(none)["blended"]["visible_cm"][0])
 
 
 def test_peers_have_the_published_figures():
     peers = results.load_peers()
     assert peers["house_depth"]["Voxfield 10 cm"]["visible_cm"] == [3.09]
     assert peers["house_lidar"]["HIO-SDF"]["recall"] == [0.793]
-    metrics = {key for systems in peers.values() for row in systems.values() for key in row}
-    assert metrics <= metrics.METRICS.keys()
+    known = {key for systems in peers.values() for row in systems.values() for key in row}
+    assert known <= metrics.METRICS.keys()
 
 
 def test_figure(tmp_path):
@@ -380,9 +384,10 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 import numpy as np
 from pathlib import Path
+from benchmarks import records
 from benchmarks.accuracy import __main__, figure, measure
 assert not figure.save_figure(Path("never.png"), {}, {})
-from hiosdf_jax.evaluation import GroundTruth
+from hiosdf_jax._src.scoring.metrics import GroundTruth
 from hiosdf_jax.datasets import FrameStream
 stream = FrameStream("s", 1, lambda i: (np.ones((3, 3)), np.eye(4)))
 truth = GroundTruth(*5 * [np.zeros((0, 3))])

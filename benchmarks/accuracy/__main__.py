@@ -1,20 +1,22 @@
-"""The command: streams x configurations x seeds, measured, compared and drawn."""
+"""The command that measures, compares and draws streams x configurations x seeds."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+from benchmarks import records
 from benchmarks.accuracy import figure, gate, results
 from benchmarks.accuracy.measure import measure, open_source
 from hiosdf_jax import Config
-from hiosdf_jax._src.command.run import to_json
 
-_BASELINE = Path(__file__).parents[1] / "results" / "accuracy_baseline.json"
+_BASELINE = records.RESULTS / "accuracy_baseline.json"
+_TABLES = records.RESULTS / "accuracy.json"
 
 # {table: {row: fields of the configuration that it changes}}
 ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
@@ -24,8 +26,8 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "one local ray": {"local_points": 1},
         "no Eikonal loss": {"eikonal_weight": 0.0},
         "last weights": {"weight_average": 0.0},
-        "serves the network": {"grid_share": 0.0},
-        "serves the grid": {"grid_share": 1.0},
+        "network alone": {"grid_share": 0.0},
+        "grid alone": {"grid_share": 1.0},
     },
     "voxel_size": {f"{edge} m": {"voxel_size": edge} for edge in (0.05, 0.1, 0.2)},
     "grid_share": {f"{share}": {"grid_share": share} for share in (0.0, 0.5, 0.8, 0.9, 1.0)},
@@ -36,10 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the benchmark.
 
     Args:
-        arguments: Those after the command's name; by default those of the process.
+        arguments: Those after the command's name; those of the process if left out.
 
     Returns:
-        The exit code: 1 if a figure is worse than in the baseline.
+        The exit code, 1 if a figure is worse than in the baseline.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -60,47 +62,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if missing:
         parser.error(f"{missing[0]}: no such file")
 
-    records, groups, peers = [], {}, {}
-    for name in options.streams:
-        source = open_source(options.data, name, options.frames)
-        if source.complete:  # peers have mapped whole streams
-            peers[name] = results.load_peers().get(name, {})
-        for config_name in options.configs:
-            for row, changes in table.items():
-                label = ", ".join(filter(None, (config_name, row)))
-                for seed in options.seeds:
-                    changed = overrides | changes
-                    record = measure(source, config_name, seed, options.every, changed)
-                    records.append(record)
-                    groups.setdefault((name, label), []).append(record)
-                    _write(options.output, records)  # a long run that is cut off leaves its start
-    rows = {}
-    for name in options.streams:
-        for (stream, label), group in groups.items():
-            if stream == name:
-                for variant, figures in results.figures_of(group).items():
-                    rows[stream, label, variant] = figures
-        for peer, figures in peers.get(name, {}).items():
-            rows[name, peer, ""] = figures
-    print("\n" + results.format_tables(rows) + "\n")
+    groups, peers = _measure(options, table)
+    runs = [run for group in groups.values() for run in group]
+    print("\n" + results.format_tables(_rows(options.streams, groups, peers)) + "\n")
     print(f"wrote {options.output}")
     picture = options.output.with_suffix(".png")
     drawn = figure.save_figure(picture, groups, peers)
     print(f"wrote {picture}" if drawn else "no figure of the error over time: it needs matplotlib")
 
+    if options.update_tables:
+        results.update_tables(_TABLES, groups)
+        print(f"wrote {_TABLES}")
     if options.ablation:
         print("not compared with the baseline: many configurations of one name")
         return 0
     if options.update_baseline:
-        gate.update_baseline(options.baseline, records)
+        gate.update_baseline(options.baseline, runs)
         print(f"wrote {options.baseline}")
         return 0
     if overrides:
-        print("what was changed is compared with the configuration as it is")
-    verdict = gate.compare(gate.load_baseline(options.baseline), records)
+        print("changed configurations are compared with the unchanged ones")
+    verdict = gate.compare(records.read(options.baseline), runs)
     for heading, lines in (
         ("not compared", verdict.skipped),
-        ("better than the baseline (--update-baseline takes it over)", verdict.better),
+        ("better than the baseline (accept them with --update-baseline)", verdict.better),
         ("WORSE than the baseline", verdict.worse),
     ):
         if lines:
@@ -109,9 +94,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if verdict.worse else 0
 
 
-def _write(path: Path, records: list[dict[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(to_json(records), indent=1) + "\n", "utf-8")
+def _measure(options: argparse.Namespace, table: Mapping[str, dict[str, Any]]) -> tuple[Any, Any]:
+    """Returns the runs by (stream, label of the configuration), and the peers by stream."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    peers: dict[str, dict[str, results.Figures]] = {}
+    overrides = dict(options.override)
+    changed = [f"{field}={value}" for field, value in overrides.items()]
+    for name in options.streams:
+        source = open_source(options.data, name, options.frames)
+        if source.complete:  # peers have mapped whole streams
+            peers[name] = results.load_peers().get(name, {})
+        for config_name, (row, changes) in product(options.configs, table.items()):
+            label = ", ".join(filter(None, (config_name, *changed, row)))
+            group = groups.setdefault((name, label), [])
+            for seed in options.seeds:
+                group.append(measure(source, config_name, seed, options.every, overrides | changes))
+                # A long run that is cut off leaves its start.
+                records.write(options.output, [run for runs in groups.values() for run in runs])
+    return groups, peers
+
+
+def _rows(
+    streams: Sequence[str],
+    groups: Mapping[tuple[str, str], list[dict[str, Any]]],
+    peers: Mapping[str, Mapping[str, results.Figures]],
+) -> dict[tuple[str, str, str], results.Figures]:
+    """Returns the rows of the table, the peers of each stream below our own."""
+    rows = {}
+    for name in streams:
+        for (stream, label), group in groups.items():
+            if stream == name:
+                for variant, figures in results.figures_of(group).items():
+                    rows[stream, label, variant] = figures
+        for peer, figures in peers.get(name, {}).items():
+            rows[name, peer, ""] = figures
+    return rows
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -137,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_positive,
         default=10,
         metavar="N",
-        help="score after each N frames, for the figure (default: %(default)s)",
+        help="score after every N frames, for the figure (default: %(default)s)",
     )
     parser.add_argument(
         "--override",
@@ -145,19 +162,24 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="change a field of the configurations; may be given several times",
+        help="change a field of the configurations; repeatable",
     )
-    parser.add_argument("--ablation", choices=ABLATIONS, help="run a table of such changes")
+    parser.add_argument("--ablation", choices=ABLATIONS, help="run a table of changes")
     parser.add_argument("--baseline", type=Path, default=_BASELINE, metavar="FILE")
     parser.add_argument(
         "--update-baseline", action="store_true", help="write the figures into the baseline"
+    )
+    parser.add_argument(
+        "--update-tables",
+        action="store_true",
+        help="write the figures that the documents show into their record",
     )
     parser.add_argument(
         "--output",
         type=Path,
         default=Path("hiosdf_output/accuracy.json"),
         metavar="FILE",
-        help="all figures; the picture is beside it (default: %(default)s)",
+        help="all runs; the picture is written beside it (default: %(default)s)",
     )
     return parser
 

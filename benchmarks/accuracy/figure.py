@@ -13,7 +13,7 @@ from hiosdf_jax._src.scoring.metrics import METRICS
 
 _METRICS = ("visible_cm", "within_3m_cm", "eikonal", "cosine")
 _REAL_METRICS = ("median_cm", "mean_cm", "p90_cm")  # of streams without ground truth
-_STYLES = {"grid": ":", "network": "--", "served": "-"}
+_STYLES = {"grid": ":", "network": "--", "blended": "-"}
 
 
 def save_figure(
@@ -21,18 +21,18 @@ def save_figure(
     groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]],
     peers: Mapping[str, Mapping[str, Figures]],
 ) -> bool:
-    """Draws the scores over the frames: a row a stream, a column a metric.
+    """Draws the scores over the frames, with one row per stream and one column per metric.
 
-    Lines are means over the seeds, the bands around them their range; colours tell configurations.
-    Of peers only the end is known: level grey lines.
+    Lines are means over the seeds, and the bands around them are their range. Each configuration
+    has a color. Gray level lines are the peers, of which only the last score is known.
 
     Args:
         path: The picture.
-        groups: {(stream, configuration): records from `measure`}.
+        groups: {(stream, configuration): runs from `measure`}.
         peers: {stream: {peer: figures}}.
 
     Returns:
-        Whether it was drawn: not without matplotlib.
+        Whether it was drawn; False without matplotlib.
     """
     try:
         from matplotlib.figure import Figure  # without pyplot: no display is needed
@@ -44,7 +44,7 @@ def save_figure(
     axes = drawing.subplots(len(streams), len(_METRICS), squeeze=False)
     for row, stream in zip(axes, streams, strict=True):
         chosen = {label: group for (name, label), group in groups.items() if name == stream}
-        first = next(iter(chosen.values()))[0]["variants"]["served"]["over_time"][0]
+        first = next(iter(chosen.values()))[0]["variants"]["blended"]["over_time"][0]
         metrics = _METRICS if "visible_cm" in first else _REAL_METRICS
         for ax, metric in zip(row, metrics, strict=False):
             for label, group in chosen.items():
@@ -72,7 +72,7 @@ def _draw_line(
     group: Sequence[dict[str, Any]],
     variant: str,
     metric: str,
-    colour: str,
+    color: str,
     style: str,
     label: str,
 ) -> None:
@@ -84,5 +84,5 @@ def _draw_line(
         ],
         float,
     )
-    ax.plot(frames, values.mean(axis=0), style, color=colour, lw=1.3, label=f"{label}, {variant}")
-    ax.fill_between(frames, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, lw=0)
+    ax.plot(frames, values.mean(axis=0), style, color=color, lw=1.3, label=f"{label}, {variant}")
+    ax.fill_between(frames, values.min(axis=0), values.max(axis=0), color=color, alpha=0.15, lw=0)

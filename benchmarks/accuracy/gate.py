@@ -2,37 +2,37 @@
 
 A figure is worse if its mean over the seeds has moved the wrong way by more than the largest of:
 three standard errors of the difference, from the spread between the seeds on both sides; 5 % of the
-baseline; 0.02 cm, or 0.002 of what has no unit.
+baseline; 0.02 cm, or 0.002 for a figure without a unit.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.accuracy.results import figures_of, meaning
+from benchmarks import records
+from benchmarks.accuracy.results import describe, figures_of, meaning
 from hiosdf_jax._src.scoring.metrics import METRICS, format_score
 
 _ERRORS = 3.0
 _SHARE = 0.05
 _FLOORS = {"cm": 0.02, "-": 0.002}
 
-# {stream: {configuration: {"frames", "device", "jax", "seeds", "figures": {variant: figures}}}}
+# {stream: {configuration: what `describe` gives and "figures": {variant: figures}}}
 Baseline = dict[str, dict[str, dict[str, Any]]]
 
 
 class Verdict(NamedTuple):
-    """What a comparison found; lines for a terminal.
+    """The result of a comparison, as lines for a terminal.
 
     Attributes:
-        worse: Figures that got worse, or cannot be told any more.
-        better: Figures that got better by as much.
+        worse: Figures that got worse, or that became NaN.
+        better: Figures that got better by more than the tolerance.
         skipped: What was not compared, and why.
-        compared: How many figures were.
+        compared: Number of figures that were compared.
     """
 
     worse: list[str]
@@ -41,53 +41,35 @@ class Verdict(NamedTuple):
     compared: int
 
 
-def load_baseline(path: Path) -> Baseline:
-    """Reads a baseline.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The baseline; an empty one if there is no such file.
-    """
-    return json.loads(path.read_text("utf-8")) if path.exists() else {}
-
-
-def update_baseline(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    """Writes the figures of runs into a baseline; those of other runs in it stay.
+def update_baseline(path: Path, runs: Sequence[dict[str, Any]]) -> None:
+    """Writes the figures of runs into a baseline; its other entries stay.
 
     Args:
         path: The file; made if it is not there.
-        records: From `measure`, without overrides.
+        runs: From `measure`, without overrides.
     """
-    baseline = load_baseline(path)
-    for (stream, config_name), group in by_map(records).items():
-        baseline.setdefault(stream, {})[config_name] = {
-            "frames": group[0]["frames"],
-            "device": group[0]["device"],
-            "jax": group[0]["jax"],
-            "seeds": [record["seed"] for record in group],
-            "figures": {
-                variant: {name: values for name, values in figures.items() if _is_number(values)}
-                for variant, figures in figures_of(group).items()
-            },
+    baseline = records.read(path)
+    for (stream, config_name), group in by_map(runs).items():
+        figures = {
+            variant: {name: values for name, values in sorted(figures.items()) if _finite(values)}
+            for variant, figures in figures_of(group).items()
         }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(baseline, indent=1, sort_keys=True) + "\n", "utf-8")
+        baseline.setdefault(stream, {})[config_name] = describe(group) | {"figures": figures}
+    records.write(path, baseline)
 
 
-def compare(baseline: Baseline, records: Sequence[dict[str, Any]]) -> Verdict:
+def compare(baseline: Baseline, runs: Sequence[dict[str, Any]]) -> Verdict:
     """Compares runs with a baseline.
 
     Args:
-        baseline: From `load_baseline`.
-        records: From `measure`, of one configuration for each name.
+        baseline: What `update_baseline` wrote.
+        runs: From `measure`, with one configuration for each name.
 
     Returns:
         The verdict.
     """
     verdict = Verdict([], [], [], 0)
-    for (stream, config_name), group in by_map(records).items():
+    for (stream, config_name), group in by_map(runs).items():
         name = f"{stream} {config_name}"
         entry = baseline.get(stream, {}).get(config_name)
         if entry is None:
@@ -107,21 +89,22 @@ def compare(baseline: Baseline, records: Sequence[dict[str, Any]]) -> Verdict:
                     continue
                 verdict = verdict._replace(compared=verdict.compared + 1)
                 change = _worsening(figure, old, new)
-                if abs(change) <= tolerance(figure, old, new):  # False for NaN
+                allowed = tolerance(figure, old, new)
+                if abs(change) <= allowed:  # False for NaN
                     continue
-                told = f"{place} {_show(figure, old)} -> {_show(figure, new)}"
-                told += f" (tolerance {_show(figure, [tolerance(figure, old, new)])})"
-                (verdict.better if change < 0 else verdict.worse).append(told)
+                line = f"{place} {_show(figure, old)} -> {_show(figure, new)}"
+                line += f" (tolerance {_show(figure, [allowed])})"
+                (verdict.better if change < 0 else verdict.worse).append(line)
     return verdict
 
 
 def tolerance(figure: str, old: Sequence[float], new: Sequence[float]) -> float:
-    """How far a figure may move without a word; see the top of this module.
+    """Returns how far a figure may move; the top of this module has the rule.
 
     Args:
         figure: A metric, or a metric and a band.
-        old: One value a seed.
-        new: One value a seed.
+        old: One value per seed.
+        new: One value per seed.
 
     Returns:
         The tolerance, in the figure's unit.
@@ -134,18 +117,18 @@ def tolerance(figure: str, old: Sequence[float], new: Sequence[float]) -> float:
     return float(np.nanmax([_ERRORS * error, _SHARE * abs(np.mean(old)), floor]))
 
 
-def by_map(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+def by_map(runs: Sequence[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
     """Groups runs that differ in their seeds alone.
 
     Args:
-        records: From `measure`, of one configuration for each name.
+        runs: From `measure`, with one configuration for each name.
 
     Returns:
-        {(stream, configuration): records}.
+        {(stream, configuration): runs}.
     """
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for record in records:
-        groups.setdefault((record["stream"], record["config_name"]), []).append(record)
+    for run in runs:
+        groups.setdefault((run["stream"], run["config_name"]), []).append(run)
     return groups
 
 
@@ -161,5 +144,5 @@ def _show(figure: str, values: Sequence[float]) -> str:
     return format_score(meaning(figure), values)
 
 
-def _is_number(values: Sequence[float]) -> bool:
+def _finite(values: Sequence[float]) -> bool:
     return bool(np.isfinite(values).all())

@@ -1,4 +1,7 @@
-"""Maps a stream and scores, along the way and at its end, three ways of asking the map."""
+"""Maps a stream, and scores the map along the way and at the end.
+
+Each score has three variants: the grid alone, the network alone, and both blended.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 import hiosdf_jax as hio
+from benchmarks import records
 from hiosdf_jax import datasets
 from hiosdf_jax._src.command import run
 from hiosdf_jax._src.field import blend
@@ -21,10 +25,10 @@ from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.scoring import metrics
 from hiosdf_jax._src.state import Field
 
-# Forgetting is the error in the region of so many first frames, right after them and at the end.
+# Forgetting compares the error in the region of the first frames, right after them and at the end.
 EARLY_FRAMES = 20
 
-# Parts of a mesh tell which surface points are on thin things; the streams' own truth does not.
+# The parts of a mesh tell which surface points are on thin things. The streams' truth does not.
 _MESHES = {"house_depth": "small_house.ply", "house_lidar": "small_house.ply"}
 
 _HELD_OUT_SEED = 0
@@ -34,11 +38,11 @@ class Source(NamedTuple):
     """A stream to measure on.
 
     Attributes:
-        name: Of the stream.
+        name: Name of the stream.
         stream: Its frames.
-        truth: Exact distances; None for a real stream, which is scored on frames held out.
+        truth: Exact distances; None for a real stream, which is scored on held-out frames.
         extent: Its bounds and range.
-        complete: No frame was left off its end.
+        complete: Whether all frames of the recording are in it.
     """
 
     name: str
@@ -53,11 +57,11 @@ def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
 
     Args:
         folder: With NAME.npz.
-        name: Of the stream; "demo" is the simulated apartment.
-        frames: Only the first so many.
+        name: Name of the stream; "demo" is the simulated apartment.
+        frames: How many frames to keep, from the first on; all if left out.
 
     Returns:
-        The stream, with what one pass over it tells.
+        The stream with its truth and its bounds.
     """
     if name == "demo":
         from hiosdf_jax import demo
@@ -84,13 +88,13 @@ def measure(
     Args:
         source: The stream.
         config_name: "light", "paper" or "default".
-        seed: Of the map's randomness, and of the order of the clouds' rows.
-        every: The map is scored after each so many frames, and after the last.
+        seed: Seed of the map's randomness and of the order of the clouds' rows.
+        every: Number of frames between two scores; the last frame is always scored.
         overrides: Fields of the configuration to change.
 
     Returns:
-        A record for JSON: what was run, times, and `variants`: by grid, network and served the
-        `scores`, the scores by band of true distance as `bands`, and the scores `over_time`.
+        A run for JSON with its identity, its times and `variants`. Each of grid, network and
+        blended has `scores`, `bands` (scores by band of true distance) and `over_time`.
     """
     extent = source.extent
     config = getattr(hio.Config, config_name)(
@@ -125,7 +129,7 @@ def measure(
                 scores = _score_held_out(field, ask, held_out_world)
             else:
                 scores = metrics.evaluate(ask, source.truth, pose[:3, 3], frame)
-                if name == "served":
+                if name == "blended":
                     scores |= metrics.evaluate_lower(
                         lambda points: _lower(field, points),  # noqa: B023 - called at once
                         source.truth,
@@ -151,12 +155,10 @@ def measure(
         "seed": seed,
         "frames": count,
         "config": dataclasses.asdict(config),
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
         "compile_and_first_update_ms": times_ms[0],
         "update_ms": _spread(times_ms[1:]),
         "variants": variants,
-    }
+    } | records.provenance()
 
 
 def _grid_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -167,7 +169,7 @@ def _grid_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array
 VARIANTS: dict[str, Callable[..., tuple[jax.Array, jax.Array]]] = {
     "grid": jax.jit(_grid_sdf_and_grad),
     "network": jax.jit(blend.network_sdf_and_grad),
-    "served": jax.jit(hio.sdf_and_grad),
+    "blended": hio.sdf_and_grad,  # compiled already
 }
 _lower = jax.jit(lambda field, points: hio.query(field, points).lower)
 _observed = jax.jit(lambda field, points: hio.query(field, points).observed)

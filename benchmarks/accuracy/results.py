@@ -1,33 +1,37 @@
-"""The figures of all runs: gathered over seeds, and laid out as a table."""
+"""The figures of all runs: gathered over seeds, laid out as a table, and written to a record."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import records
 from hiosdf_jax._src.scoring.metrics import METRICS, format_score, lay_out
 
 _PEERS = Path(__file__).with_name("peers.json")
 
-Figures = dict[str, list[float]]  # {metric, or "metric band": one value a seed}
+# What the tables of the documents show.
+_TABLE_METRICS = ("visible_cm", "recall", "fpr", "thin_share", "median_cm", "p90_cm")
+
+Figures = dict[str, list[float]]  # {metric, or "metric band": one value per seed}
 
 
-def figures_of(records: Sequence[dict[str, Any]]) -> dict[str, Figures]:
+def figures_of(runs: Sequence[dict[str, Any]]) -> dict[str, Figures]:
     """Gathers the figures of runs that differ in their seeds alone.
 
     Args:
-        records: From `measure`.
+        runs: From `measure`.
 
     Returns:
         {variant: figures}, for all figures that were measured.
     """
     gathered: dict[str, Figures] = {}
-    for record in records:
-        for variant, measured in record["variants"].items():
+    for run in runs:
+        for variant, measured in run["variants"].items():
             figures = gathered.setdefault(variant, {})
             flat = dict(measured["scores"])
             for band, scores in measured["bands"].items():
@@ -38,15 +42,45 @@ def figures_of(records: Sequence[dict[str, Any]]) -> dict[str, Figures]:
 
 
 def meaning(figure: str) -> str:
-    """The metric of a figure.
+    """Returns the metric of a figure.
 
     Args:
         figure: A metric, or a metric and a band.
 
     Returns:
-        A key of `evaluation.METRICS`.
+        A key of `METRICS`.
     """
     return figure.split(" ", 1)[0]
+
+
+def describe(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Returns what identifies runs that differ in their seeds alone.
+
+    Args:
+        runs: From `measure`.
+
+    Returns:
+        Their number of frames, device, version of jax, revision and seeds.
+    """
+    shared = {key: runs[0][key] for key in ("frames", "device", "jax", "revision")}
+    return shared | {"seeds": [run["seed"] for run in runs]}
+
+
+def update_tables(path: Path, groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]]) -> None:
+    """Writes the figures that the documents show into their record; other entries stay.
+
+    Args:
+        path: The record; made if it is not there.
+        groups: {(stream, label of the configuration): runs from `measure`}.
+    """
+    record = records.read(path)
+    for (stream, label), runs in groups.items():
+        figures = figures_of(runs)
+        record.setdefault(stream, {})[label] = describe(runs) | {
+            "mean": _for_tables(figures, np.mean),
+            "half_range": _for_tables(figures, lambda values: np.ptp(values) / 2),
+        }
+    records.write(path, record)
 
 
 def load_peers() -> dict[str, dict[str, Figures]]:
@@ -75,20 +109,34 @@ def format_tables(rows: Mapping[tuple[str, str, str], Figures]) -> str:
         The table. Several seeds are given as their mean and half of their range.
     """
     names = [key for key in METRICS if any(key in figures for figures in rows.values())]
-    cells = [["stream", "map", "asked", *names]]
+    cells = [["stream", "map", "variant", *names]]
     for labels, figures in rows.items():
         cells.append([*labels, *(_cell(name, figures.get(name)) for name in names)])
     tables = [lay_out(cells, text_columns=3)]
     banded = dict.fromkeys(name for figures in rows.values() for name in figures if " " in name)
     bands = list(dict.fromkeys(name.split(" ", 1)[1] for name in banded))
     if bands:
-        cells = [["stream", "map", "asked", "by true distance", *bands]]
+        cells = [["stream", "map", "variant", "by true distance", *bands]]
         for labels, figures in rows.items():
             for metric in dict.fromkeys(meaning(name) for name in figures if name in banded):
                 values = (figures.get(f"{metric} {band}") for band in bands)
                 cells.append([*labels, metric, *(_cell(metric, value) for value in values)])
         tables.append(lay_out(cells, text_columns=4))
     return "\n\n".join(tables)
+
+
+def _for_tables(
+    figures: Mapping[str, Figures], statistic: Callable[[list[float]], Any]
+) -> dict[str, dict[str, float]]:
+    """Returns {variant: {metric: a statistic over the seeds}}."""
+    return {
+        variant: {
+            metric: records.rounded(float(statistic(values[metric])))
+            for metric in _TABLE_METRICS
+            if metric in values
+        }
+        for variant, values in figures.items()
+    }
 
 
 def _cell(name: str, values: list[float] | None) -> str:

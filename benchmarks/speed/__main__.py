@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
 import platform
 import sys
@@ -16,9 +15,9 @@ from pathlib import Path
 import jax
 from tqdm import tqdm
 
-from benchmarks.speed.rows import Row, format_table
+from benchmarks import records
+from benchmarks.speed.rows import Row, format_table, to_record
 from benchmarks.speed.tasks import FULL, OUT_OF_TIME, QUICK, Bench, Task, open_bench, plan
-from hiosdf_jax._src.command.run import to_json
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,21 +75,14 @@ def _run(bench: Bench, name: str, task: Task) -> list[Row]:
 
 
 def _write(path: Path, stream: str, bench: Bench, rows: list[Row], took_s: float) -> None:
-    record = {
-        "stream": stream,
-        "device": jax.devices()[0].device_kind,
-        "host": _host(),
-        "jax": jax.__version__,
-        "took_s": took_s,
+    baselines = bench.baselines.items()
+    record = {"stream": stream, "host": _host(), "took_s": records.rounded(took_s)}
+    record |= records.provenance() | {
         "sizes": dataclasses.asdict(bench.sizes),
-        "rows": [dataclasses.asdict(row) for row in rows],
-        "baselines": {
-            key: [dataclasses.asdict(one) for one in found]
-            for key, found in bench.baselines.items()
-        },
+        "rows": [to_record(row) for row in rows],
+        "baselines": {key: [to_record(one) for one in found] for key, found in baselines},
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(to_json(record), indent=1) + "\n", "utf-8")
+    records.write(path, record)
 
 
 def _host() -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks import records
 from hiosdf_jax._src.scoring.metrics import lay_out
 
 
@@ -74,6 +75,20 @@ def single(value: float) -> Spread:
     return Spread(value, value, value, value, 1)
 
 
+def to_record(measured: Row | Baseline) -> dict[str, Any]:
+    """Flattens a row or a baseline for its record, without what it does not have."""
+    fields = dataclasses.asdict(measured)
+    spread = fields.pop("spread") or {}
+    if spread.get("count") == 1:
+        spread = {"median": spread["median"]}
+    first = {key: fields.pop(key) for key in ("name", "unit") if key in fields}
+    return {
+        key: records.rounded(value) if isinstance(value, float) else value
+        for key, value in (first | spread | fields).items()
+        if value is not False and value != "" and value == value  # NaN differs from itself
+    }
+
+
 def time_ms(
     function: Callable[..., Any],
     *arguments: Any,
@@ -117,9 +132,11 @@ def format_table(rows: Sequence[Row], baselines: Baselines) -> str:
         if spread is None:
             numbers = ["FAILED" if row.failed else "none", "", "", ""]
         elif spread.count == 1:
-            numbers = [_number(spread.median), "", "", ""]
+            numbers = [format_number(spread.median), "", "", ""]
         else:
-            numbers = [_number(x) for x in (spread.median, spread.p10, spread.p90, spread.p99)]
+            numbers = [
+                format_number(x) for x in (spread.median, spread.p10, spread.p90, spread.p99)
+            ]
         share = "" if math.isnan(row.share) else f"{100 * row.share:.1f} %"
         start = [name, row.unit, *numbers, row.limit, share]
         beside = [_compare(spread, one) for one in baselines.get(row.compare, ())]
@@ -147,12 +164,12 @@ def _compare(spread: Spread | None, baseline: Baseline) -> tuple[str, str, str]:
     """Name and median of a baseline, and the row's median as a multiple of it."""
     if baseline.spread is None:
         return f"{baseline.name}: {baseline.reason}", "none", ""
-    multiple = "" if spread is None else _number(spread.median / baseline.spread.median)
-    return baseline.name, _number(baseline.spread.median), multiple
+    multiple = "" if spread is None else format_number(spread.median / baseline.spread.median)
+    return baseline.name, format_number(baseline.spread.median), multiple
 
 
-def _number(value: float) -> str:
-    """Three digits or more."""
+def format_number(value: float) -> str:
+    """Writes a number with three significant digits, or more before the point."""
     if not math.isfinite(value):
         return str(value)
     digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0

@@ -1,0 +1,74 @@
+"""Committed records: small JSON files that say what was measured, where, and at which revision."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from hiosdf_jax._src.command.run import to_json
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+def provenance() -> dict[str, str]:
+    """Names what a run is measured on.
+
+    Returns:
+        The device, the version of jax and the revision of this checkout; "unknown" outside of one.
+    """
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=7"]
+    try:
+        revision = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        revision = "unknown"
+    return {
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "revision": revision.strip(),
+    }
+
+
+def read(path: Path) -> Any:
+    """Reads a record.
+
+    Args:
+        path: The file.
+
+    Returns:
+        What `write` was given; an empty dict if there is no such file.
+    """
+    return json.loads(path.read_text("utf-8")) if path.exists() else {}
+
+
+def write(path: Path, value: Any) -> None:
+    """Writes a record with each innermost list or object on one line.
+
+    Args:
+        path: The file; its folder is made if it is not there.
+        value: Dicts, lists, strings and numbers. Numbers that are not finite become null.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(_lay_out(to_json(value), "") + "\n", "utf-8")
+
+
+def rounded(value: float, digits: int = 6) -> float:
+    """Rounds a number to significant digits; tables show fewer."""
+    return float(f"{value:.{digits}g}")
+
+
+def _lay_out(value: Any, indent: str) -> str:
+    pairs = value.items() if isinstance(value, dict) else [("", item) for item in value]
+    if not any(isinstance(item, dict | list) for _, item in pairs):
+        return json.dumps(value)
+    deeper = indent + " "
+    lines = []
+    for key, item in pairs:
+        text = _lay_out(item, deeper) if isinstance(item, dict | list) else json.dumps(item)
+        lines.append(deeper + (f"{json.dumps(key)}: " if isinstance(value, dict) else "") + text)
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return "\n".join([opening, ",\n".join(lines), indent + closing])
