@@ -1,0 +1,178 @@
+"""Tables of times: a GPU, two CPU cores, and how much they vary from run to run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks import records
+from benchmarks.speed.rows import format_number
+from benchmarks.tables.markdown import lay_out
+
+_HALF = "slopes of 1 in 2"
+_QUERY = "sdf and gradient of 102,400"
+_STAGES = (
+    "calibration",
+    "window",
+    "fusion",
+    "rays",
+    "fading",
+    "distance",
+    "frontier",
+    "grid samples",
+    "local samples",
+    "training",
+)
+
+Record = dict[str, Any]  # what the command `benchmarks.speed` writes
+
+
+def gpu() -> str:
+    """Updates, training and queries on one GPU."""
+    record = records.read(records.RESULTS / "speed_h100.json")
+    training = "the paper's training, 10 epochs of 60,000"
+    rows = {
+        "an update, `Config.default`": "update, default",
+        "an update, `Config.paper`": "update, paper",
+        "the same with the slopes of half of the samples": f"update, paper, {_HALF}",
+        "the paper's training, 10 epochs of 60,000 samples": training,
+        "its training with the slopes of half of the samples": f"{training}, {_HALF}",
+        "102,400 distances with gradient, the paper's network": f"{_QUERY}, the paper's network",
+        "102,400 distances with gradient, `Config.default`": f"{_QUERY}, blended, default",
+        "1,048,576 distances with gradient, baked at 5 cm": (
+            "sdf and gradient of 1,048,576, baked, default"
+        ),
+        "an update, `Config.light`, map of 10 m": "update, light, a map of 10 m",
+        "an update, `Config.light`, map of 60 m": "update, light, a map of 60 m",
+    }
+    cells = [
+        [
+            label,
+            _number(_row(record, name), "median"),
+            _number(_row(record, name), "p99"),
+            _number(_row(record, f"{name}, on the device alone"), "median"),
+            "" if name.startswith("update") else _number(_beside(record, name), "median"),
+        ]
+        for label, name in rows.items()
+    ]
+    columns = ["median", "p99", "compiled function alone", "PyTorch eager, TF32"]
+    return lay_out(["one H100, ms", *columns], cells)
+
+
+def cpu() -> str:
+    """Updates, a whole run, training and queries on two CPU cores."""
+    record = records.read(records.RESULTS / "speed_cpu.json")
+    rows = {
+        "an update, `Config.light`": "update, light",
+        "the first update, which compiles": "compilation of update, light",
+        "`hiosdf map` of the house: maps, scores, draws": "hiosdf map, the whole stream, light",
+        "its peak of resident memory": "resident memory, peak of hiosdf map",
+        "the map's arrays": "arrays of the map, light",
+        "102,400 distances with gradient, `Config.light`": f"{_QUERY}, blended, light",
+        "102,400 distances with gradient, the grid alone": f"{_QUERY}, grid, light",
+        "102,400 distances with gradient, the paper's network": f"{_QUERY}, the paper's network",
+        "the paper's training, 1 epoch of 60,000 samples": (
+            "the paper's training, 1 epochs of 60,000"
+        ),
+    }
+    cells = []
+    for label, name in rows.items():
+        row = _row(record, name)
+        beside = _beside(record, name) if "the paper's" in name else {}
+        unit = row["unit"]
+        cells.append([label, *(_with_unit(one, unit) for one in (row, beside))])
+    return lay_out(["two CPU cores", "median", "PyTorch eager"], cells)
+
+
+def stages() -> str:
+    """The stages of an update one by one, on a GPU and on two CPU cores."""
+    gpu, cpu = (records.read(records.RESULTS / f"speed_{one}.json") for one in ("h100", "cpu"))
+    cells = [
+        [
+            name,
+            _number(_row(gpu, f"{name}, paper"), "median"),
+            _number(_row(cpu, f"{name}, light"), "median"),
+        ]
+        for name in _STAGES
+    ]
+    return lay_out(["stage, ms", "H100, `Config.paper`", "two CPU cores, `Config.light`"], cells)
+
+
+def runs() -> str:
+    """Whole updates over all runs on one kind of GPU, each on a machine of its own."""
+    found = records.read(records.RESULTS / "speed_h100_runs.json")
+    cells = []
+    for label, name in (
+        ("`Config.default`", "update, default"),
+        ("`Config.paper`", "update, paper"),
+        ("`Config.paper`, slopes of half of the samples", f"update, paper, {_HALF}"),
+    ):
+        rows = [row for row in (_row(record, name) for record in found) if row]
+        cells.append([label, str(len(rows)), *(_range(rows, key) for key in ("median", "p99"))])
+    for record in found:
+        if donated := _row(record, "update, paper, donated"):
+            kept = _beside(record, "update, paper, donated")
+            for label, row in (("kept", kept), ("donated, in turns with it", donated)):
+                numbers = (_number(row, key) for key in ("median", "p99"))
+                cells.append([f"`Config.paper`, the old map {label}", "1", *numbers])
+    return lay_out(["an update, ms", "runs", "median", "p99"], cells)
+
+
+def ratios() -> str:
+    """How an update grows with the map and with the number of updates, over the same runs."""
+    found = records.read(records.RESULTS / "speed_h100_runs.json")
+    pairs = [
+        (_row(record, "update, light, a map of 60 m"), _row(record, "update, light, a map of 10 m"))
+        for record in found
+    ]
+    last = "10,000 updates in a row, light, last 10 %"
+    ends = [(_row(record, last), _beside(record, last)) for record in found]
+    cells = []
+    for label, both in (
+        ("map of 60 m : map of 10 m around the same sensor", pairs),
+        ("last thousand of 10,000 updates : first thousand", ends),
+    ):
+        found = [{"ratio": one["median"] / other["median"]} for one, other in both if one and other]
+        cells.append([label, str(len(found)), _range(found, "ratio")])
+    return lay_out(["`Config.light`, medians", "runs", "ratio"], cells)
+
+
+TABLES = {
+    "speed-gpu": gpu,
+    "speed-cpu": cpu,
+    "speed-stages": stages,
+    "speed-runs": runs,
+    "speed-ratios": ratios,
+}
+
+
+def _row(record: Record, name: str) -> dict[str, Any]:
+    """A row by its name; empty if the record has none."""
+    return next((row for row in record["rows"] if row["name"] == name), {})
+
+
+def _beside(record: Record, name: str) -> dict[str, Any]:
+    """The last baseline of a row; empty if it has none."""
+    found = record["baselines"].get(_row(record, name).get("compare"))
+    return found[-1] if found else {}
+
+
+def _number(row: dict[str, Any], key: str) -> str:
+    return format_number(row[key]) if key in row else ""
+
+
+def _with_unit(row: dict[str, Any], unit: str) -> str:
+    if "median" not in row:
+        return ""
+    value = row["median"]
+    larger = {"ms": "s", "MB": "GB"}
+    if value >= 1000 and unit in larger:
+        value, unit = value / 1000, larger[unit]
+    return f"{format_number(value)} {unit}"
+
+
+def _range(rows: list[dict[str, Any]], key: str) -> str:
+    values = [row[key] for row in rows]
+    low, high = (format_number(float(one)) for one in (np.min(values), np.max(values)))
+    return low if low == high else f"{low} to {high}"
