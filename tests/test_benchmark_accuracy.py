@@ -112,7 +112,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     assert served["over_time"][0]["visible_cm"] == pytest.approx(first, rel=1e-4)
     assert served["over_time"][0]["surface_cm"] is None  # NaN, which JSON does not have
     grid = record["variants"]["grid"]
-    surface = grid_sdf(config, state.grid.surface, truth.surface_points_world)
+    surface = grid_sdf(config, surface_of(state.grid), truth.surface_points_world)
     mean_cm = 100 * float(np.abs(surface).mean())
     assert grid["scores"]["surface_cm"] == pytest.approx(mean_cm, rel=1e-4)
     assert grid["bands"]["5-20 cm"]["visible_cm"] < 3
@@ -126,7 +126,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     cloud, pose = stream[5]
     returns = cloud + pose[:3, 3]
     returns = returns[np.asarray(hio.query(held, returns).observed)]
-    error_cm = 100 * np.abs(grid_sdf(config, held.grid.surface, returns))
+    error_cm = 100 * np.abs(grid_sdf(config, surface_of(held.grid), returns))
     assert len(returns) > 300 and np.median(error_cm) < 5
     median_cm = real["variants"]["grid"]["scores"]["median_cm"]
     assert median_cm == pytest.approx(np.median(error_cm), rel=1e-3)
