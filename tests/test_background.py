@@ -30,7 +30,7 @@ def test_the_map_is_that_of_a_plain_loop(empty):
             assert int(mapper.field.updates) == k + 1
             np.testing.assert_array_equal(hio.sdf(mapper.field, POINTS), hio.sdf(expected, POINTS))
     assert mapper.dropped == 0
-    np.testing.assert_array_equal(state.grid.hits, expected.grid.hits)
+    np.testing.assert_array_equal(state.grid.evidence.hits, expected.grid.evidence.hits)
 
 
 def test_the_newest_frame_takes_the_place_of_one_that_waits(empty, monkeypatch):

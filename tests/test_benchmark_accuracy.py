@@ -22,6 +22,7 @@ from hiosdf_jax import datasets
 from hiosdf_jax._src.command import run
 from hiosdf_jax._src.grid.lookup import grid_sdf
 from hiosdf_jax._src.scoring import metrics
+from hiosdf_jax._src.state import surface_of
 
 FRAMES = 8
 
@@ -102,7 +103,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     assert blended["over_time"][0]["surface_cm"] is None  # NaN, which JSON does not have
     grid = record["variants"]["grid"]
     ask_grid = jax.jit(grid_sdf, static_argnums=0)
-    surface = ask_grid(CONFIG, state.grid.surface, truth.surface_points_world)
+    surface = ask_grid(CONFIG, surface_of(state.grid), truth.surface_points_world)
     mean_cm = 100 * float(np.abs(surface).mean())
     assert grid["scores"]["surface_cm"] == pytest.approx(mean_cm, rel=1e-4)
     assert grid["bands"]["5-20 cm"]["visible_cm"] < 3
@@ -116,7 +117,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     cloud, pose = stream[5]
     returns = cloud + pose[:3, 3]
     returns = returns[np.asarray(hio.query(held, returns).observed)]
-    error_cm = 100 * np.abs(ask_grid(CONFIG, held.grid.surface, returns))
+    error_cm = 100 * np.abs(ask_grid(CONFIG, surface_of(held.grid), returns))
     assert len(returns) > 300 and np.median(error_cm) < 5
     median_cm = real["variants"]["grid"]["scores"]["median_cm"]
     assert median_cm == pytest.approx(np.median(error_cm), rel=1e-3)

@@ -304,10 +304,10 @@ def test_the_evidence_s_work_is_the_size_of_its_arrays():
     assert work["rays"].memory == 2 * size(window, *traced) + read
 
     def a_voxel(*names):
-        return size(state.grid, *names) / state.grid.hits.size
+        return size(state.grid, *names) / state.grid.evidence.hits.size
 
     # One of nearest's three numbers, two of the three axes; a sample is written with its weight.
-    whole = size(state.grid, *traced, "hits", "sdf", "nearest") - 2 * state.grid.hits.size
+    whole = size(state.grid, *traced, "hits", "sdf", "nearest") - 2 * state.grid.evidence.hits.size
     asked = 8 * a_voxel("nearest", "sdf") + a_voxel("mean") + 2 / 3 * a_voxel("axes") + 5 * 4
     samples = CONFIG.near_samples + CONFIG.far_samples
     drawn = limits.grid_samples_work(CONFIG)

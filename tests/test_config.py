@@ -1,4 +1,4 @@
-"""Every field of the configuration is checked, and the lattice follows from the bounds."""
+"""Every field of the configuration is checked, and the voxel grid follows from the bounds."""
 
 import dataclasses
 import math
@@ -6,9 +6,18 @@ import math
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.config import _LIMITS
 
 BOUNDS = ((0, 0, 0), (2, 2, 2))
+LIMITS = [
+    (field.name, *field.metadata["limits"])
+    for field in dataclasses.fields(hio.Config)
+    if "limits" in field.metadata
+]
+
+
+def test_the_bare_constructor_is_the_default():
+    assert hio.Config(BOUNDS) == hio.Config.default(BOUNDS)
+    assert hio.Config(BOUNDS) != hio.Config.paper(BOUNDS)
 
 
 def test_the_paper_s_numbers():
@@ -39,7 +48,7 @@ def test_the_paper_s_numbers():
     assert {name: getattr(config, name) for name in expected} == expected
 
 
-@pytest.mark.parametrize("name, low, high", _LIMITS)
+@pytest.mark.parametrize("name, low, high", LIMITS)
 def test_limits_are_named(name, low, high):
     for value in (low - 1, high * 2 + 1, math.nan, math.inf):
         with pytest.raises(ValueError, match=rf"Config\.{name} is .*, expected"):
@@ -53,7 +62,7 @@ def test_limits_are_named(name, low, high):
 
 
 def test_every_number_has_limits():
-    limited = {name for name, _, _ in _LIMITS} | {"bounds", "range_noise"}
+    limited = {name for name, _, _ in LIMITS} | {"bounds", "range_noise"}
     assert limited == {field.name for field in dataclasses.fields(hio.Config)}
 
 

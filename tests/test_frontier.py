@@ -48,14 +48,14 @@ def state():
 
 
 def test_a_maps_frontier_is_the_distance_to_unseen_voxels_and_to_its_border(state):
-    seen = np.asarray(lookup.observed(state.grid.passes, state.grid.hits))
+    seen = np.asarray(is_observed(state.grid.evidence.passes, state.grid.evidence.hits))
     assert 0.2 < seen.mean() < 0.95
     # What lies beyond the bounds has not been seen: one more layer of voxels says that.
     padded = np.pad(seen, 1)
     expected = 0.1 * brute_force(padded, CONFIG.frontier_voxels)[1:-1, 1:-1, 1:-1]
     step = CONFIG.frontier_horizon / 127
     np.testing.assert_array_equal(
-        state.grid.surface.frontier, np.clip(np.floor(expected / step + 1e-4), -127, 127)
+        state.grid.derived.frontier, np.clip(np.floor(expected / step + 1e-4), -127, 127)
     )
     index = np.argwhere(np.ones(seen.shape, bool))
     centers = np.asarray(geometry.voxel_center(CONFIG, jnp.asarray(index)))
@@ -65,7 +65,7 @@ def test_a_maps_frontier_is_the_distance_to_unseen_voxels_and_to_its_border(stat
 
 
 def test_the_sign_is_that_of_the_containing_voxel(state):
-    seen = np.asarray(lookup.observed(state.grid.passes, state.grid.hits))
+    seen = np.asarray(is_observed(state.grid.evidence.passes, state.grid.evidence.hits))
     points = np.random.default_rng(1).uniform(*BOUNDS, (4000, 3)).astype(np.float32)
     index, _, _ = geometry.voxel_of(CONFIG, jnp.asarray(points))
     answer = hio.query(state, points)

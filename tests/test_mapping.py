@@ -112,7 +112,7 @@ def test_scan_and_user_jit_equal_the_eager_loop(empty, mapped):
 
     last, reports = scanned(empty, clouds, poses)
     # The cloud is not padded inside jit (250 rows, not 300): the result must not depend on that.
-    assert arrays_equal(last.grid.hits, mapped.grid.hits)
+    assert arrays_equal(last.grid.evidence.hits, mapped.grid.evidence.hits)
     assert closeness(last, mapped) < 1e-5
     assert int(last.updates) == 4
     assert reports.points_used.shape == (4,)
@@ -138,8 +138,8 @@ def test_vmap_over_two_maps_equals_each(empty):
     for k, state in enumerate((empty, other)):
         alone = hio.update(state, *frames[k])
         part = jax.tree.map(lambda leaf, k=k: leaf[k], together)
-        assert arrays_equal(part.grid.hits, alone.grid.hits)
-        assert arrays_equal(part.grid.passes, alone.grid.passes)
+        assert arrays_equal(part.grid.evidence.hits, alone.grid.evidence.hits)
+        assert arrays_equal(part.grid.evidence.passes, alone.grid.evidence.passes)
         assert closeness(part, alone) < 1e-4
 
 
@@ -204,13 +204,13 @@ def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty):
     assert int(state.report.points_outside) == 1
     assert int(state.report.points_used) == 1
     assert hio.Flag(int(state.report.flags)) == hio.Flag.POINTS_OUTSIDE
-    assert float(jnp.sum(state.grid.hits)) == 1
-    assert float(state.grid.passes[-1, 10, 8]) > 0
+    assert float(jnp.sum(state.grid.evidence.hits)) == 1
+    assert float(state.grid.evidence.passes[-1, 10, 8]) > 0
     # A sensor that is far outside of the box with all its points must not harm the map either.
     pose = np.eye(4)
     pose[0, 3] = 50
     far = hio.update(state, cloud, pose)
-    assert arrays_equal(far.grid.hits, state.grid.hits)
+    assert arrays_equal(far.grid.evidence.hits, state.grid.evidence.hits)
     assert np.isfinite(np.asarray(hio.sdf(far, np.zeros((1, 3))))).all()
 
 
@@ -219,7 +219,7 @@ def test_range_limits_are_counted(empty):
     state = hio.update(empty, cloud, np.eye(4))
     assert int(state.report.points_out_of_range) == 2
     assert int(state.report.points_used) == 1
-    assert float(jnp.sum(state.grid.hits)) == 1
+    assert float(jnp.sum(state.grid.evidence.hits)) == 1
 
 
 def test_equivariance_to_moves_by_whole_voxels(mapped):
@@ -233,7 +233,7 @@ def test_equivariance_to_moves_by_whole_voxels(mapped):
         pose = pose.copy()
         pose[:3, 3] += move
         state = hio.update(state, cloud, pose)
-    assert np.mean(np.asarray(state.grid.hits != mapped.grid.hits)) < 0.01
+    assert np.mean(np.asarray(state.grid.evidence.hits != mapped.grid.evidence.hits)) < 0.01
     points = np.random.default_rng(2).uniform(-0.5, 0.5, (200, 3)).astype(np.float32)
     difference = hio.sdf(state, points + move) - hio.sdf(mapped, points)
     assert float(jnp.mean(jnp.abs(difference))) < 0.02
@@ -377,7 +377,7 @@ def test_a_cloud_out_of_range_still_trains_on_the_grid(mapped):
     far = hio.update(mapped, np.full((50, 3), 30.0), np.eye(4))
     index, _, _ = geometry.voxel_of(CONFIG, jnp.asarray([[0.3, 0.3, 0.3]]))
     at = tuple(np.asarray(index)[0])
-    assert float(far.grid.passes[at]) > float(mapped.grid.passes[at])
+    assert float(far.grid.evidence.passes[at]) > float(mapped.grid.evidence.passes[at])
 
 
 def test_an_empty_cloud_inside_jit_is_flagged(mapped):
@@ -434,7 +434,7 @@ def test_far_returns_are_averaged_like_near_ones():
     for offset in offsets:
         grid = fuse(grid, jnp.asarray([[30.05 + offset, 0.05, 0.05]], jnp.float32))
     index, _, _ = geometry.voxel_of(config, jnp.asarray([[30.05, 0.05, 0.05]]))
-    mean = np.asarray(grid.surface.mean)[tuple(np.asarray(index)[0])]
+    mean = np.asarray(grid.evidence.mean)[tuple(np.asarray(index)[0])]
     assert abs(0.1 * mean[0] - offsets.mean()) < 1e-3
 
 

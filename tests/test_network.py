@@ -143,7 +143,7 @@ def test_training_fits_and_serves_without_a_bias():
     trained, last, _ = jax.jit(lambda n, s: train(TINY, n, s, 400))(network, samples)
     assert float(last.sdf) < 0.2 * float(first.sdf)
     points = samples.points_world - trained.origin_world
-    residual = siren.predict(TINY, trained.served, points) - samples.sdf
+    residual = siren.predict(TINY, trained.average, points) - samples.sdf
     assert abs(np.median(np.asarray(residual)[np.asarray(samples.weight) > 0])) < 1e-6
 
 
@@ -188,7 +188,7 @@ def test_each_slope_counts_once_in_as_many_epochs(monkeypatch, every, tile):
         chosen = place % every == epoch % every
 
         def objective(params, chosen=chosen):
-            model = siren.siren(config)
+            model = siren.network_of(config)
             value = jax.vmap(lambda point: model.apply(params, point))(points)
             gradient = jax.vmap(jax.grad(lambda point: model.apply(params, point)))(points)
             error, slope = jnp.abs(value - samples.sdf), jnp.linalg.norm(gradient, axis=-1)
@@ -308,7 +308,7 @@ def test_the_average_is_of_old_and_new_weights():
     trained, *_ = train(TINY, network, samples, 5, average=0.75)
     old, new, served = (
         np.asarray(tree["params"]["Dense_0"]["kernel"])
-        for tree in (network.served, trained.params, trained.served)
+        for tree in (network.average, trained.params, trained.average)
     )
     np.testing.assert_allclose(served, 0.75 * old + 0.25 * new, atol=1e-6)
 

@@ -125,10 +125,10 @@ def test_the_scale_is_of_gap_and_spread(field):
 
 
 def test_beyond_the_bounds_nothing_is_doubtful(field):
-    nothing = jnp.zeros_like(field.surface.doubt)
+    nothing = jnp.zeros_like(field.surface.derived.doubt)
     low = np.asarray(CONFIG.bounds[0], np.float32)
     face = jnp.asarray([[low[0], 0.05, 0.05], [low[0] + 0.05, 0.05, 0.05]])
-    value = lookup.doubt(CONFIG, field.surface.replace(doubt=nothing), face)
+    value = lookup.doubt_distance(CONFIG, field.surface.replace(doubt=nothing), face)
     np.testing.assert_allclose(value, [0.5 * CONFIG.distance_horizon, 0], atol=1e-5)
 
 
@@ -143,6 +143,6 @@ def test_a_carved_surface_still_counts_for_the_lower_bound():
     for _ in range(2):
         state = hio.update(state, wall * [1, 0.5, 0.5], pose)
     here = jnp.asarray(thing[:1], jnp.float32)
-    assert float(lookup.grid_sdf(config, state.grid.surface, here)[0]) > 0.3
-    assert float(lookup.doubt(config, state.grid.surface, here)[0]) < 0.1
+    assert float(lookup.grid_sdf(config, surface_of(state.grid), here)[0]) > 0.3
+    assert float(lookup.doubt_distance(config, surface_of(state.grid), here)[0]) < 0.1
     assert float(hio.query(state, here).lower[0]) < 0.05

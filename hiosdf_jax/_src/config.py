@@ -1,4 +1,4 @@
-"""The configuration of a map: every number a user can choose, validated on construction."""
+"""The configuration of a map: every number that a user can choose, checked on construction."""
 
 from __future__ import annotations
 
@@ -10,95 +10,128 @@ from typing import Any
 Point = tuple[float, float, float]
 Bounds = tuple[Point, Point]
 
-# Bounds given as multiples of the voxel size must not gain a voxel from rounding (0.3 / 0.1 < 3).
-_LATTICE_TOLERANCE_VOXELS = 1e-4
+# Bounds that are multiples of the voxel size must not gain a voxel from rounding (0.3 / 0.1 < 3).
+_TOLERANCE_VOXELS = 1e-4
 
-# The nine numbers of each voxel's principal axes are counted by an int32; such a map has 9.5 GB.
+# An int32 counts the nine numbers of each voxel's principal axes. Such a map has 9.5 GB.
 _MOST_VOXELS = (2**31 - 1) // 9
+
+
+def _number(default: float, least: float, greatest: float) -> Any:
+    """Makes a field with its limits; its annotation says whether it must be whole."""
+    return dataclasses.field(default=default, metadata={"limits": (least, greatest)})
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Static part of a map: frozen, hashable, validated.
+    """Static part of a map: frozen, hashable, checked on construction.
 
-    Make one with `Config.paper`, `Config.light` or `Config.default`; the bare constructor has the
-    paper's numbers (HIO-SDF, arXiv 2310.09463; sections in brackets).
+    `Config(bounds)` and `Config.default(bounds)` are the same. `Config.paper` has the numbers of
+    HIO-SDF (arXiv 2310.09463; sections in brackets), `Config.light` suits two CPU cores.
 
     Attributes:
         bounds: Corners ((x0, y0, z0), (x1, y1, z1)) of the mapped box, m, world frame. The grid
-            covers it with whole voxels of the lattice that has a corner at the world's origin.
-        voxel_size: Edge of a voxel of the coarse grid, m [IV-B].
-        max_points: Rows of a cloud that one update uses; larger clouds are drawn from at random,
+            covers it with whole voxels; a voxel corner lies at the world's origin.
+
+        Clouds:
+        max_points: Rows of a cloud that one update uses. Larger clouds are drawn from at random,
             smaller ones padded, so that one compilation serves a whole stream [IV-C].
-        min_range: Returns nearer than this are ignored, m.
-        max_range: Returns farther than this only clear the ray up to it, m.
-        range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m;
-            only its relative size matters: hits are averaged with weight 1 / sigma^2.
-        min_hits: Hits a voxel needs before its surface counts.
-        min_hit_ratio: Share hits / (hits + passes) below which a surface that fills its voxel is
-            carved away; of smaller ones less is asked, by their area.
-        evidence_limit: Rays a voxel remembers; older evidence fades once there are more.
-        distance_horizon: Largest distance that the grid resolves, m; at most 127 voxels.
+        min_range: Nearer returns are ignored, m.
+        max_range: Farther returns only clear their ray up to this range, m.
+        range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m.
+            Hits are averaged with weight 1 / sigma^2, so only relative sizes matter.
+
+        Grid [IV-B]:
+        voxel_size: Edge of a voxel, m.
+        min_hits: Hits that a voxel needs before its patch counts as surface.
+        min_hit_ratio: A patch that fills its voxel is carved below this share
+            hits / (hits + passes); smaller patches need less, by their area.
+        evidence_limit: Rays that a voxel remembers; older evidence fades beyond that.
+        distance_horizon: Largest distance to a patch that the grid resolves, m; <= 127 voxels.
         frontier_horizon: Largest distance to unseen space that the grid resolves, m.
-        near_samples: Samples an update draws where |sdf| < near_distance (the paper's N) [IV-B].
-        far_samples: Samples an update draws in the rest of the observed map (M) [IV-B].
+
+        Samples per update:
+        near_samples: Grid samples where |sdf| < near_distance (the paper's N) [IV-B].
+        far_samples: Grid samples in the rest of the observed map (M) [IV-B].
         near_distance: The paper's epsilon, m [IV-B].
         local_points: Points of the newest cloud whose rays are sampled (S) [IV-C].
         local_ray_samples: Stratified samples on each of these rays (Q) [IV-C].
-        local_truncation: Samples go this far behind the point, and are kept while their distance
-            is less (t), m [IV-C].
-        local_max_range: Only points nearer than this are chosen for local samples, m.
-        hidden_width: Width of the SIREN's layers [IV-A].
-        hidden_layers: Sine layers of this width after the input layer [IV-A].
-        frequency: The SIREN's omega_0 [IV-A].
-        sdf_weight: Weight of the L1 distance loss [IV-D].
-        eikonal_weight: Weight of the Eikonal loss [IV-D].
-        eikonal_every: The Eikonal loss takes one sample in n, other ones in each epoch.
-        learning_rate: Of AdamW [IV-D].
-        weight_decay: Of AdamW [IV-D].
-        batches: Steps an epoch makes, each on its share of the samples; 1 is the paper's
-            full-batch optimisation [IV-D].
-        epochs: Epochs an update makes [IV-D].
-        warmup_epochs: The same for the first `warmup_updates` updates.
-        warmup_updates: How many updates count as the first ones.
-        weight_average: Share of the old weights in the running average over updates that queries
-            use; 0 serves the latest weights. Training itself never sees the average.
-        grid_share: Share of the grid's own distance in what queries answer where it knows one; the
-            network has the rest, and all of what lies beyond the horizon. 0 is the paper's.
+        local_truncation: Samples reach this far behind the point, and are kept while their
+            distance to the cloud is less (t), m [IV-C].
+        local_max_range: Local samples use points nearer than this, m.
+
+        Network [IV-A]:
+        hidden_width: Width of the SIREN's layers.
+        hidden_layers: Hidden layers after the input layer.
+        frequency: The SIREN's omega_0.
+
+        Training [IV-D]:
+        sdf_weight: Weight of the L1 distance loss.
+        eikonal_weight: Weight of the Eikonal loss.
+        eikonal_every: The Eikonal loss uses one sample in this many, other samples in each epoch.
+        learning_rate: AdamW learning rate.
+        weight_decay: AdamW weight decay.
+        batches: Gradient steps per epoch, each on its share of the samples; the paper's full-batch
+            training has 1.
+        epochs: Epochs per update.
+        warmup_epochs: Epochs per update during the first `warmup_updates` updates.
+        warmup_updates: Number of warm-up updates.
+
+        Queries:
+        weight_average: Share of the old weights in the average over updates that queries use. With
+            0 they use the latest weights. Training never uses the average.
+        grid_share: Share of the grid's distance in the answer where the grid has one. The network
+            has the rest, and answers alone beyond the horizon. With 0 the network answers alone,
+            as in the paper.
+
+    Example:
+        >>> config = hio.Config.light(bounds=((0, 0, 0), (10, 8, 3)), max_range=6.0)
     """
 
     bounds: Bounds
-    voxel_size: float = 0.10
-    max_points: int = 50_000
-    min_range: float = 0.1
-    max_range: float = 20.0
+
+    # Clouds
+    max_points: int = _number(50_000, 1, 10_000_000)
+    min_range: float = _number(0.1, 0.0, 1e4)
+    max_range: float = _number(20.0, 1e-3, 1e4)
     range_noise: tuple[float, float] = (0.005, 0.002)
-    min_hits: int = 2
-    min_hit_ratio: float = 0.25
-    evidence_limit: float = 100.0
-    distance_horizon: float = 3.0
-    frontier_horizon: float = 1.0
-    near_samples: int = 10_000
-    far_samples: int = 30_000
-    near_distance: float = 0.05
-    local_points: int = 1_000
-    local_ray_samples: int = 20
-    local_truncation: float = 0.2
-    local_max_range: float = 6.0
-    hidden_width: int = 256
-    hidden_layers: int = 4
-    frequency: float = 10.0
-    sdf_weight: float = 5.0
-    eikonal_weight: float = 2.0
-    eikonal_every: int = 1
-    learning_rate: float = 4e-4
-    weight_decay: float = 0.012
-    batches: int = 1
-    epochs: int = 10
-    warmup_epochs: int = 50
-    warmup_updates: int = 5
-    weight_average: float = 0.9
-    grid_share: float = 0.0
+
+    # Grid
+    voxel_size: float = _number(0.10, 1e-3, 10.0)
+    min_hits: int = _number(2, 1, 1_000)
+    min_hit_ratio: float = _number(0.25, 0.0, 1.0)
+    evidence_limit: float = _number(100.0, 1.0, 1000.0)
+    distance_horizon: float = _number(3.0, 1e-3, 1e4)
+    frontier_horizon: float = _number(1.0, 1e-3, 1e4)
+
+    # Samples per update
+    near_samples: int = _number(10_000, 1, 10_000_000)
+    far_samples: int = _number(30_000, 1, 10_000_000)
+    near_distance: float = _number(0.05, 1e-4, 1e3)
+    local_points: int = _number(100, 1, 1_000_000)
+    local_ray_samples: int = _number(20, 1, 10_000)
+    local_truncation: float = _number(0.2, 1e-3, 1e3)
+    local_max_range: float = _number(6.0, 1e-3, 1e4)
+
+    # Network
+    hidden_width: int = _number(128, 1, 4_096)
+    hidden_layers: int = _number(4, 1, 64)
+    frequency: float = _number(10.0, 1e-3, 1e3)
+
+    # Training
+    sdf_weight: float = _number(5.0, 0.0, 1e6)
+    eikonal_weight: float = _number(2.0, 0.0, 1e6)
+    eikonal_every: int = _number(4, 1, 1_000)
+    learning_rate: float = _number(4e-4, 0.0, 1.0)
+    weight_decay: float = _number(0.012, 0.0, 1.0)
+    batches: int = _number(1, 1, 10_000)
+    epochs: int = _number(10, 1, 100_000)
+    warmup_epochs: int = _number(50, 1, 100_000)
+    warmup_updates: int = _number(5, 0, 1_000_000)
+
+    # Queries
+    weight_average: float = _number(0.9, 0.0, 0.999)
+    grid_share: float = _number(0.9, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", _checked_bounds(self.bounds))
@@ -110,9 +143,11 @@ class Config:
                 f"Config.range_noise is {noise!r}, expected two numbers (a, b)"
             ) from None
         object.__setattr__(self, "range_noise", (floor, growth))
-        for name, low, high in _LIMITS:
-            value = getattr(self, name)
-            whole = Config.__dataclass_fields__[name].type == "int"
+        for field in dataclasses.fields(self):
+            if "limits" not in field.metadata:
+                continue
+            name, whole = field.name, field.type == "int"
+            value, (low, high) = getattr(self, name), field.metadata["limits"]
             if isinstance(value, bool) or not isinstance(value, numbers.Real):
                 raise ValueError(f"Config.{name} is {value!r}, expected a number")
             try:
@@ -143,7 +178,7 @@ class Config:
         samples = self.near_samples + self.far_samples + self.local_points * self.local_ray_samples
         if self.batches > samples:
             raise ValueError(
-                f"Config.batches is {self.batches!r}, expected at most one a sample, {samples}"
+                f"Config.batches is {self.batches!r}, expected at most one per sample, {samples}"
             )
         voxels = math.prod(self.grid_shape)
         if voxels < 1:
@@ -158,8 +193,13 @@ class Config:
             )
 
     @classmethod
-    def paper(cls, bounds: Any, **overrides: Any) -> Config:
-        """The paper's network, samples and schedule.
+    def default(cls, bounds: Any, **overrides: Any) -> Config:
+        """Returns the best configuration for a GPU: grid and network answer together.
+
+        The blend is more accurate than either. The grid's patches are also more accurate than the
+        newest cloud alone, so few local samples are needed. On an H100 over the streams of the
+        benchmarks, half of the paper's width and a quarter of the slopes cost 0.01 cm and halve
+        the time of an update.
 
         Args:
             bounds: ((x0, y0, z0), (x1, y1, z1)), m, world frame.
@@ -169,13 +209,13 @@ class Config:
             The configuration.
 
         Raises:
-            ValueError: A value is out of range; the message names field, value and bound.
+            ValueError: A value is out of range; the message names field, value and limits.
         """
         return cls(**_known({"bounds": bounds} | overrides))
 
     @classmethod
-    def light(cls, bounds: Any, **overrides: Any) -> Config:
-        """The same pipeline, sized for two CPU cores.
+    def paper(cls, bounds: Any, **overrides: Any) -> Config:
+        """Returns the paper's network, samples and schedule; the network answers alone.
 
         Args:
             bounds: ((x0, y0, z0), (x1, y1, z1)), m, world frame.
@@ -185,122 +225,81 @@ class Config:
             The configuration.
 
         Raises:
-            ValueError: A value is out of range; the message names field, value and bound.
+            ValueError: A value is out of range; the message names field, value and limits.
+        """
+        return cls(**_known(_PAPER | {"bounds": bounds} | overrides))
+
+    @classmethod
+    def light(cls, bounds: Any, **overrides: Any) -> Config:
+        """Returns the same pipeline, sized for two CPU cores.
+
+        Args:
+            bounds: ((x0, y0, z0), (x1, y1, z1)), m, world frame.
+            **overrides: Any other field of `Config`.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ValueError: A value is out of range; the message names field, value and limits.
         """
         return cls(**_known(_LIGHT | {"bounds": bounds} | overrides))
 
-    @classmethod
-    def default(cls, bounds: Any, **overrides: Any) -> Config:
-        """The best we know for a GPU: grid and network served together, more accurate than either.
-
-        The grid's features are also more accurate than the newest cloud alone, so that few local
-        samples are left.
-
-        Args:
-            bounds: ((x0, y0, z0), (x1, y1, z1)), m, world frame.
-            **overrides: Any other field of `Config`.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            ValueError: A value is out of range; the message names field, value and bound.
-        """
-        return cls(**_known(_DEFAULT | {"bounds": bounds} | overrides))
-
     @property
     def corner_index(self) -> tuple[int, int, int]:
-        """Lattice index of the grid's first voxel: it starts at corner_index * voxel_size, m."""
-        low, _ = self._lattice_bounds()
+        """World index of the grid's first voxel; its corner is at corner_index * voxel_size, m."""
+        low, _ = self._voxel_bounds()
         return low
 
     @property
     def grid_shape(self) -> tuple[int, int, int]:
         """Voxels along x, y and z."""
-        low, high = self._lattice_bounds()
+        low, high = self._voxel_bounds()
         return (high[0] - low[0], high[1] - low[1], high[2] - low[2])
 
     @property
     def horizon_voxels(self) -> int:
         """The distance horizon in whole voxels, rounded up."""
-        return math.ceil(self.distance_horizon / self.voxel_size - _LATTICE_TOLERANCE_VOXELS)
+        return math.ceil(self.distance_horizon / self.voxel_size - _TOLERANCE_VOXELS)
 
     @property
     def frontier_voxels(self) -> int:
         """The frontier's horizon in whole voxels, rounded up."""
-        return math.ceil(self.frontier_horizon / self.voxel_size - _LATTICE_TOLERANCE_VOXELS)
+        return math.ceil(self.frontier_horizon / self.voxel_size - _TOLERANCE_VOXELS)
 
-    def _lattice_bounds(self) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+    def _voxel_bounds(self) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
         (x0, y0, z0), (x1, y1, z1) = self.bounds
 
         def down(value: float) -> int:
-            return math.floor(value / self.voxel_size + _LATTICE_TOLERANCE_VOXELS)
+            return math.floor(value / self.voxel_size + _TOLERANCE_VOXELS)
 
         def up(value: float) -> int:
-            return math.ceil(value / self.voxel_size - _LATTICE_TOLERANCE_VOXELS)
+            return math.ceil(value / self.voxel_size - _TOLERANCE_VOXELS)
 
         return (down(x0), down(y0), down(z0)), (up(x1), up(y1), up(z1))
 
 
-# name, least, greatest value; the annotation of the field says whether it must be whole.
-_LIMITS: tuple[tuple[str, float, float], ...] = (
-    ("voxel_size", 1e-3, 10.0),
-    ("max_points", 1, 10_000_000),
-    ("min_range", 0.0, 1e4),
-    ("max_range", 1e-3, 1e4),
-    ("min_hits", 1, 1_000),
-    ("min_hit_ratio", 0.0, 1.0),
-    ("evidence_limit", 1.0, 1000.0),
-    ("distance_horizon", 1e-3, 1e4),
-    ("frontier_horizon", 1e-3, 1e4),
-    ("near_samples", 1, 10_000_000),
-    ("far_samples", 1, 10_000_000),
-    ("near_distance", 1e-4, 1e3),
-    ("local_points", 1, 1_000_000),
-    ("local_ray_samples", 1, 10_000),
-    ("local_truncation", 1e-3, 1e3),
-    ("local_max_range", 1e-3, 1e4),
-    ("hidden_width", 1, 4_096),
-    ("hidden_layers", 1, 64),
-    ("frequency", 1e-3, 1e3),
-    ("sdf_weight", 0.0, 1e6),
-    ("eikonal_weight", 0.0, 1e6),
-    ("eikonal_every", 1, 1_000),
-    ("learning_rate", 0.0, 1.0),
-    ("weight_decay", 0.0, 1.0),
-    ("batches", 1, 10_000),
-    ("epochs", 1, 100_000),
-    ("warmup_epochs", 1, 100_000),
-    ("warmup_updates", 0, 1_000_000),
-    ("weight_average", 0.0, 0.999),
-    ("grid_share", 0.0, 1.0),
-)
-
-# Grid and network are served together. Measured on an H100 over the streams of the benchmarks, a
-# network of half the width with a quarter of the slopes costs 0.01 cm there, and halves the update.
-_DEFAULT: dict[str, Any] = {
-    "grid_share": 0.9,
-    "local_points": 100,
-    "hidden_width": 128,
-    "eikonal_every": 4,
+# Differences from the default.
+_PAPER: dict[str, Any] = {
+    "local_points": 1_000,
+    "hidden_width": 256,
+    "eikonal_every": 1,
+    "grid_share": 0.0,
 }
 
 _LIGHT: dict[str, Any] = {
     "max_points": 20_000,
     "near_samples": 8_000,
     "far_samples": 24_000,
-    "local_points": 100,
     "local_ray_samples": 10,
-    "hidden_width": 128,
     "hidden_layers": 2,
-    "batches": 8,
     "eikonal_weight": 0.5,
-    "epochs": 1,
-    "warmup_epochs": 5,
     "eikonal_every": 2,
     "learning_rate": 1e-3,
+    "batches": 8,
+    "epochs": 1,
+    "warmup_epochs": 5,
     "weight_average": 0.8,
-    "grid_share": 0.9,
 }
 
 

@@ -1,4 +1,4 @@
-"""The pytrees of a map: what `update` carries from cloud to cloud, and what a planner holds."""
+"""The pytrees: the map that `update` carries, and the fields that planners hold."""
 
 from __future__ import annotations
 
@@ -7,29 +7,41 @@ from typing import Any, NamedTuple
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 
+NO_FEATURE = -128
+"""`Derived.nearest` of a voxel without a surface patch within the distance horizon."""
+
+FRONTIER_STEPS = 127
+"""`Derived.frontier` counts steps; the frontier horizon is this many steps long."""
+
+
+def frontier_step_m(config: Config) -> float:
+    """Returns the length of a step of `Derived.frontier`, m."""
+    return config.frontier_horizon / FRONTIER_STEPS
+
 
 class Flag(enum.IntFlag):
-    """What has gone wrong since the map was made; bits of `Report.flags`, never cleared."""
+    """Problems since the map was made: bits of `Report.flags`, never cleared."""
 
     BAD_POSE = 1
-    """A pose was not finite or not rigid: that update changed nothing else."""
+    """A pose was not finite or not rigid. That update changed nothing else."""
     EMPTY_CLOUD = 2
-    """A cloud had no finite row: that update changed nothing else."""
+    """A cloud had no finite row. That update changed nothing else."""
     POINTS_OUTSIDE = 4
-    """Points in range fell outside the bounds: they cleared their rays but left no surface."""
+    """Returns in range fell outside the bounds. Their rays cleared space but left no surface."""
     TRAINING_FAILED = 8
-    """A training step gave a value that is not finite: the network was kept as it was."""
+    """A training step was not finite. The network was kept as it was."""
 
 
 class Report(flax.struct.PyTreeNode):
-    """Scalars of the last update; `flags` gathers those of all updates.
+    """Summary of the last update; `flags` collects those of all updates.
 
     Attributes:
         points_used: Points that were fused into the grid, int32.
-        points_outside: Points in range whose end lies outside the bounds, int32.
+        points_outside: Returns in range that lie outside the bounds, int32.
         points_out_of_range: Finite points nearer than min_range or farther than max_range, int32.
         points_invalid: Rows with a NaN or inf, padding included, int32.
         sdf_loss: Mean |f - s| over the samples in the last epoch, m, float32 (paper, eq. 4).
@@ -46,29 +58,45 @@ class Report(flax.struct.PyTreeNode):
     flags: jax.Array
 
 
-class Surface(flax.struct.PyTreeNode):
-    """What queries read of the grid: its surface patches, and distances derived from them.
+class Evidence(flax.struct.PyTreeNode):
+    """What each voxel remembers of the rays that met it.
 
-    Lengths are in voxels where no unit is given; offsets are from the voxel's centre.
+    Offsets are from the voxel's center, in voxels.
 
     Attributes:
+        hits: Rays that ended in the voxel (fading), (X, Y, Z) float16.
+        passes: Rays that went through it well before their end (fading), (X, Y, Z) float16.
+        behind: Rays that ended a little before it (fading), (X, Y, Z) float16.
+        root_weight: Square root of the summed weights of the hits (fading), (X, Y, Z) float16; the
+            weights of far returns are too small for float16.
         mean: Weighted mean of the hits, (X, Y, Z, 3) float16.
         axes: Principal axes of the hits, longest first, each as long as the standard deviation
-            along it; the last is the normal, pointing to the sensor's side,
-            (X, Y, Z, 3, 3) float16.
-        nearest: Offset in whole voxels to the voxel of the nearest feature, (X, Y, Z, 3) int8;
-            -128 where there is none within the horizon.
-        sdf: Signed distance of the voxel's centre to that feature, m, (X, Y, Z) float16.
-        doubt: Distance of the voxel's centre to the nearest voxel in which any ray has ended and
-            that is not all but certainly free: surfaces that were carved or met once are among
-            them, m, (X, Y, Z) float16.
-        frontier: Distance of the voxel's centre to the nearest voxel that no ray has reached, in
-            127ths of the frontier's horizon; of such voxels, minus the distance to the nearest one
-            that was reached, (X, Y, Z) int8.
+            along it, (X, Y, Z, 3, 3) float16. The last one is the normal, on the sensor's side.
     """
 
+    hits: jax.Array
+    passes: jax.Array
+    behind: jax.Array
+    root_weight: jax.Array
     mean: jax.Array
     axes: jax.Array
+
+
+class Derived(flax.struct.PyTreeNode):
+    """Distances of each voxel, derived from the evidence around it.
+
+    Attributes:
+        nearest: Offset in whole voxels to the voxel of the nearest surface patch,
+            (X, Y, Z, 3) int8; NO_FEATURE where there is none within the horizon.
+        sdf: Signed distance of the voxel's center to that patch, m, (X, Y, Z) float16.
+        doubt: Distance of the voxel's center to the nearest voxel in which any ray has ended and
+            that is not almost certainly free, m, (X, Y, Z) float16. Carved surfaces and surfaces
+            that were hit once count.
+        frontier: Distance of the voxel's center to the nearest voxel that no ray has reached, in
+            steps of 1 / 127 of the frontier horizon; in unobserved voxels, minus the distance to
+            the nearest observed one, (X, Y, Z) int8.
+    """
+
     nearest: jax.Array
     sdf: jax.Array
     doubt: jax.Array
@@ -76,51 +104,59 @@ class Surface(flax.struct.PyTreeNode):
 
 
 class Grid(flax.struct.PyTreeNode):
-    """The coarse global grid: what each voxel remembers of the rays that met it.
+    """The coarse global grid.
 
     Attributes:
-        hits: Rays that ended in the voxel (fading), (X, Y, Z) float16.
-        passes: Rays that went through it well before their end (fading), (X, Y, Z) float16.
-        behind: Rays that ended a little before it (fading), (X, Y, Z) float16.
-        weight: Root of the sum of the weights of the hits (fading), (X, Y, Z) float16.
-        surface: The patches that the hits make, and what is derived from all this.
+        evidence: What the rays left in it.
+        derived: What follows from the evidence.
     """
 
-    hits: jax.Array
-    passes: jax.Array
-    behind: jax.Array
-    weight: jax.Array
-    surface: Surface
+    evidence: Evidence
+    derived: Derived
+
+
+class Surface(flax.struct.PyTreeNode):
+    """What queries read of the grid.
+
+    Attributes:
+        mean: As in `Evidence`.
+        axes: As in `Evidence`.
+        derived: The voxels' distances.
+    """
+
+    mean: jax.Array
+    axes: jax.Array
+    derived: Derived
 
 
 class Network(flax.struct.PyTreeNode):
-    """The SIREN and its optimiser.
+    """The SIREN and its optimizer.
 
     Attributes:
         params: The weights that are trained.
-        served: The weights that queries use, a running average of `params`.
+        average: Running average of `params` over updates; queries use these weights.
         optimizer: The state of AdamW.
-        origin_world: Point that is the network's zero, (3,) m; `grow` does not move it.
+        origin_world: The network's origin, (3,) m; `grow` does not move it.
     """
 
     params: Any
-    served: Any
+    average: Any
     optimizer: Any
     origin_world: jax.Array
 
 
 class MapState(flax.struct.PyTreeNode):
-    """Everything that an update needs and changes; made by `init`, changed by `update`.
+    """A map: everything that `update` needs and changes.
 
     Attributes:
         config: The configuration; static, not a leaf.
         grid: The coarse global grid.
-        network: The SIREN and its optimiser.
-        optimism: How many of its own error scales the map errs to the free side, see
-            `uncertainty`, () float32.
+        network: The SIREN and its optimizer.
+        optimism: How far the map errs to the free side, in units of its own error scale,
+            () float32. See `hiosdf_jax.query`, `lower`.
         key: Source of all randomness, a typed key.
-        updates: Updates that changed the map so far, int32.
-        report: Scalars of the last update.
+        updates: Number of updates that changed the map, int32.
+        report: Summary of the last update.
     """
 
     config: Config = flax.struct.field(pytree_node=False)
@@ -133,16 +169,16 @@ class MapState(flax.struct.PyTreeNode):
 
 
 class Field(flax.struct.PyTreeNode):
-    """What a planner holds while the map goes on; made by `snapshot`.
+    """The part of a map that queries read; made by `snapshot`.
 
     Attributes:
         config: The map's configuration; static, not a leaf.
-        params: The network's weights that queries use.
-        origin_world: Point that is the network's zero, (3,) m.
+        params: The network's average weights.
+        origin_world: The network's origin, (3,) m.
         surface: The grid's patches and distances.
         optimism: As in `MapState`, () float32.
-        updates: Updates that the map had seen, int32.
-        stamp: When the snapshot was taken, s on the caller's clock, () float32.
+        updates: Number of updates of the map, int32.
+        stamp: Time of the snapshot, s on the caller's clock, () float32.
     """
 
     config: Config = flax.struct.field(pytree_node=False)
@@ -155,7 +191,7 @@ class Field(flax.struct.PyTreeNode):
 
 
 class Baked(flax.struct.PyTreeNode):
-    """Samples of a field on a lattice, for inner loops; made by `bake`.
+    """A field sampled on a lattice, for inner loops; made by `bake`.
 
     Attributes:
         corner_world: Position of sample (0, 0, 0), (3,) m.
@@ -163,7 +199,7 @@ class Baked(flax.struct.PyTreeNode):
         sdf: Signed distances, m, (X, Y, Z) float32.
         frontier: Distances to unseen space, m, (X, Y, Z) float32.
         lower: Lower bounds of the distance, m, (X, Y, Z) float32.
-        updates: Updates that the map had seen, int32.
+        updates: Number of updates of the map, int32.
         stamp: As in `Field`.
     """
 
@@ -177,15 +213,15 @@ class Baked(flax.struct.PyTreeNode):
 
 
 class Query(NamedTuple):
-    """What the map says of points.
+    """The answer of `query` at points.
 
     Attributes:
         sdf: Signed distance under the chosen policy for unseen space, (...) float32, m.
-        grad: Its gradient by the point, (..., 3) float32.
-        observed: Whether the voxel that contains the point has been seen, (...) bool.
-        frontier: Distance to the nearest voxel that has not been seen, (...) float32, m; not
+        grad: d(sdf)/d(point), (..., 3) float32.
+        observed: Whether a ray has reached the voxel that contains the point, (...) bool.
+        frontier: Distance to the nearest voxel that no ray has reached, (...) float32, m; not
             positive in such voxels.
-        lower: A lower bound of the true distance, (...) float32, m; see `uncertainty`.
+        lower: Lower bound of the true distance, calibrated on each new cloud, (...) float32, m.
     """
 
     sdf: jax.Array
@@ -193,3 +229,21 @@ class Query(NamedTuple):
     observed: jax.Array
     frontier: jax.Array
     lower: jax.Array
+
+
+def surface_of(grid: Grid) -> Surface:
+    """Selects what queries read of a grid, without a copy."""
+    return Surface(mean=grid.evidence.mean, axes=grid.evidence.axes, derived=grid.derived)
+
+
+def field_of(state: MapState) -> Field:
+    """Selects what queries read of a map, without a copy."""
+    return Field(
+        config=state.config,
+        params=state.network.average,
+        origin_world=state.network.origin_world,
+        surface=surface_of(state.grid),
+        optimism=state.optimism,
+        updates=state.updates,
+        stamp=jnp.zeros((), jnp.float32),
+    )

@@ -1,4 +1,4 @@
-"""`bake`: a field sampled once on a lattice, so that inner loops only interpolate."""
+"""Bakes a field: samples it once on a lattice, so that inner loops only interpolate."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.lattice import sample_counts
-from hiosdf_jax._src.field.points import field_of, query
-from hiosdf_jax._src.state import Baked, Field, MapState
+from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.state import Baked, Field, MapState, field_of
 
-_CHUNK = 65536  # samples at a time: the network's activations are many times a sample's size
+_CHUNK = 65536  # samples at a time: activations are many times larger than a sample
 
 
 def bake(
@@ -23,28 +23,31 @@ def bake(
     center: Any = None,
     size: Any = None,
 ) -> Baked:
-    """Samples a field on a lattice; the queries answer from it by trilinear interpolation.
+    """Samples a field on a lattice; queries interpolate the samples trilinearly.
 
     Args:
         field: A map or a snapshot of one.
         resolution: Spacing of the samples, m; static inside jit.
-        center: (3,) m, world frame, the middle of a window, for instance the robot; may be traced.
-            Without it the whole of the field's bounds is sampled.
-        size: (3,) m, the window's edges, with `center` alone; static inside jit.
+        center: Center of a window, for instance the robot, (3,) m, world frame; may be traced. By
+            default the whole of the field's bounds is sampled.
+        size: Edges of the window, (3,) m; required with `center`, static inside jit.
 
     Returns:
-        The baked field. Its `frontier` is less than the field's by what interpolation may add, so
-        that no unseen place looks seen.
+        The baked field. Its `frontier` is reduced by the largest interpolation error, so that no
+        unseen place looks observed.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: An argument has a wrong type, shape or value.
+
+    Example:
+        >>> baked = hio.bake(field, resolution=0.05, center=robot_position, size=(4, 4, 2))
     """
     if isinstance(field, MapState):
         field = field_of(field)
     if not isinstance(field, Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
     if (center is None) != (size is None):
-        raise ValueError("center and size are a window's: expected both of them or neither")
+        raise ValueError("center and size define a window, expected both or neither")
     if size is None:
         low, high = np.asarray(field.config.bounds)
         size, corner_world = high - low, jnp.asarray(low, jnp.float32)
@@ -72,8 +75,8 @@ def _bake(
     sdf, frontier, lower = jax.lax.map(
         sample, jnp.arange(count, dtype=jnp.int32), batch_size=min(count, _CHUNK)
     )
-    # Between samples a 1-Lipschitz function may be less by the mean distance to the corners, at
-    # most half a cell's diagonal.
+    # Between samples, a 1-Lipschitz function is less by at most the mean distance to the corners:
+    # half a cell's diagonal.
     margin = math.sqrt(3) / 2 * resolution
     return Baked(
         corner_world=corner_world,

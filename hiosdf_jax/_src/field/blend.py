@@ -1,8 +1,10 @@
-"""What is served to a planner: the grid and the network, combined into one distance.
+"""Answers of a live map: the grid and the network, blended into one distance.
 
-Near surfaces the grid's patches are the more accurate, and the network smooths the edges between
-them; beyond the grid's horizon the network goes on alone, and where nothing has been seen, since
-the side of a surface is a guess of the grid's there that may jump.
+Near surfaces the grid's patches are more accurate, and the network smooths the edges between them.
+Beyond the grid's horizon the network answers alone. It also answers alone in unseen space, where
+the grid guesses the side of a surface and the guess may jump.
+
+`lattice` has the same four functions for a baked field: `bounds`, `sdf`, `frontier`, `lower`.
 """
 
 from __future__ import annotations
@@ -10,59 +12,39 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.config import Bounds, Config
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.network import siren
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.state import Field
 
-# Where the grid's answer fades out, as shares of its horizon.
+# The grid's answer fades out between these shares of its horizon.
 _FADE = (0.8, 1.0)
 
-# As far beyond what was seen, voxels: what lies just behind a surface is sure to be inside.
+# It fades out at these distances beyond observed space, voxels: space just behind a surface is
+# certainly solid.
 _FADE_UNSEEN_VOXELS = (1.0, 3.0)
 
-# The network may correct the grid by so much, voxels: in unseen space it is a guess.
+# Largest correction of the grid by the network, voxels: in unseen space the network is a guess.
 _LARGEST_CORRECTION_VOXELS = 1.0
 
-# The scale of the error: these, and the spread of the hits. Measured over a depth and a LiDAR
-# stream: what 99 % of the points need has the least spread between the two, and the least mean.
+# Terms of the error scale, beside the spread of the hits. Measured over a depth and a LiDAR stream:
+# the bound that holds for 99 % of the points varies least between the two, and is smallest.
 _LEAST_SCALE_VOXELS = 0.3
 _GAP_SHARE = 0.5
 
-# How much nearer than any seen surface an unseen one is taken to be, if there is room for it: with
-# more, the mean bound falls faster than the errors.
+# An unseen surface is assumed at most this much nearer than any observed one: with more, the mean
+# bound falls faster than the errors.
 _HIDDEN_VOXELS = 0.3
 
 
-def network_sdf(field: Field, points_world: jax.Array) -> jax.Array:
-    """Signed distance by the network alone.
-
-    Args:
-        field: The field.
-        points_world: (..., 3) m, inside the bounds.
-
-    Returns:
-        (...) m.
-    """
-    return siren.predict(field.config, field.params, points_world - field.origin_world)
+def bounds(field: Field) -> Bounds:
+    """Returns the corners of the mapped box, m, world frame."""
+    return field.config.bounds
 
 
-def network_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Signed distance by the network alone, and its gradient.
-
-    Args:
-        field: The field.
-        points_world: (..., 3) m, inside the bounds.
-
-    Returns:
-        The distance (...) m and its gradient (..., 3).
-    """
-    return value_and_gradient(lambda points: network_sdf(field, points), points_world)
-
-
-def served_sdf(field: Field, points_world: jax.Array) -> jax.Array:
-    """Signed distance that queries answer.
+def sdf(field: Field, points_world: jax.Array) -> jax.Array:
+    """Computes the blended signed distance.
 
     Args:
         field: The field.
@@ -76,14 +58,69 @@ def served_sdf(field: Field, points_world: jax.Array) -> jax.Array:
     if config.grid_share == 0:
         return network
     grid = lookup.grid_sdf(config, field.surface, points_world)
-    return _combine(config, grid, network, lookup.frontier(config, field.surface, points_world))
+    return _combine(config, grid, network, frontier(field, points_world))
+
+
+def frontier(field: Field, points_world: jax.Array) -> jax.Array:
+    """Computes the distance to unseen space.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) m. Differentiable.
+    """
+    return lookup.frontier_distance(field.config, field.surface, points_world)
+
+
+def lower(field: Field, points_world: jax.Array) -> jax.Array:
+    """Computes a lower bound of the true distance at observed points.
+
+    The bound is cautious - optimism * scale. `mapping.calibration` measures the optimism.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) m.
+    """
+    cautious, scale = cautious_sdf(field, points_world)
+    return cautious - field.optimism * scale
+
+
+def network_sdf(field: Field, points_world: jax.Array) -> jax.Array:
+    """Computes the signed distance of the network alone.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) m.
+    """
+    return siren.predict(field.config, field.params, points_world - field.origin_world)
+
+
+def network_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Computes the signed distance of the network alone, and its gradient.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        The distance (...) m and its gradient (..., 3).
+    """
+    return value_and_gradient(lambda points: network_sdf(field, points), points_world)
 
 
 def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Distance to all that may be a surface, and the scale of its error.
+    """Computes the distance to everything that may be a surface, and the scale of its error.
 
-    What the rays carved away, or met only once, counts here. Grid and network err where they
-    disagree, and where the hits behind a patch are scattered.
+    Carved surfaces and surfaces that were hit once count. The scale grows where grid and network
+    disagree, and where the hits of a patch are scattered.
 
     Args:
         field: The field.
@@ -98,18 +135,19 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     limit = _LARGEST_CORRECTION_VOXELS * config.voxel_size
     gap = jnp.minimum(jnp.abs(network - nearest.sdf), limit)
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
-    doubt = lookup.doubt(config, field.surface, points_world)
-    frontier = lookup.frontier(config, field.surface, points_world)
-    cautious = jnp.minimum(_combine(config, nearest.sdf, network, frontier), doubt)
-    # What has not been seen may hide a surface that is nearer than all that were.
-    hidden = jnp.maximum(frontier, cautious - _HIDDEN_VOXELS * config.voxel_size)
+    doubt = lookup.doubt_distance(config, field.surface, points_world)
+    unseen = frontier(field, points_world)
+    cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen), doubt)
+    # Unseen space may hide a surface that is nearer than all observed ones.
+    hidden = jnp.maximum(unseen, cautious - _HIDDEN_VOXELS * config.voxel_size)
     return jnp.minimum(cautious, hidden), scale
 
 
 def _combine(config: Config, grid: jax.Array, network: jax.Array, frontier: jax.Array) -> jax.Array:
+    """Blends the distances of grid and network."""
     if config.grid_share == 0:
         return network
-    # No more than the distance itself: surfaces stay where the grid has them, thin ones too.
+    # The correction is at most the distance itself: surfaces, thin ones too, stay where they are.
     limit = jnp.minimum(_LARGEST_CORRECTION_VOXELS * config.voxel_size, jnp.abs(grid))
     near = grid + (1 - config.grid_share) * jnp.clip(network - grid, -limit, limit)
     start, end = (share * config.distance_horizon for share in _FADE)

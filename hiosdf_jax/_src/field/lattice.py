@@ -1,4 +1,7 @@
-"""A regular lattice of samples over a box, and trilinear interpolation between them."""
+"""Answers of a baked field: samples on a regular lattice, interpolated trilinearly.
+
+`blend` has the same four functions for a live map: `bounds`, `sdf`, `frontier`, `lower`.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,49 @@ from hiosdf_jax._src.state import Baked
 _MOST_SAMPLES = 2**31 - 1
 
 
+def bounds(baked: Baked) -> tuple[jax.Array, jax.Array]:
+    """Returns the corners of the box that a baked field covers, (3,) m each, world frame."""
+    last = jnp.asarray(baked.sdf.shape, jnp.float32) - 1
+    return baked.corner_world, baked.corner_world + last * baked.resolution
+
+
+def sdf(baked: Baked, points_world: jax.Array) -> jax.Array:
+    """Interpolates the signed distance at points (..., 3) m inside the box; (...) m."""
+    return interpolate(baked, baked.sdf, points_world)
+
+
+def frontier(baked: Baked, points_world: jax.Array) -> jax.Array:
+    """Interpolates the distance to unseen space at points (..., 3) m inside the box; (...) m."""
+    return interpolate(baked, baked.frontier, points_world)
+
+
+def lower(baked: Baked, points_world: jax.Array) -> jax.Array:
+    """Interpolates the lower bound of the distance at points (..., 3) m inside the box; (...) m."""
+    return interpolate(baked, baked.lower, points_world)
+
+
 def sample_counts(size: Any, resolution: float) -> tuple[int, int, int]:
-    """Says how many samples cover a box, on both of its faces along each axis or beyond.
+    """Counts the samples that cover a box, with samples on or beyond both faces of each axis.
 
     Args:
-        size: (3,) edges of the box, m.
+        size: Edges of the box, (3,) m.
         resolution: Spacing, m.
 
     Returns:
         Samples along x, y and z, each at least 2.
 
     Raises:
-        ValueError: The spacing is not positive, or would take too many samples.
+        ValueError: The spacing is not positive, or needs too many samples.
     """
     check_resolution(resolution)
     # Tolerant, so that 3 m at 0.1 m are 31 samples and not 32.
     intervals = np.ceil(np.asarray(size, float) / resolution - 1e-6)
     x, y, z = (int(n) + 1 for n in np.maximum(intervals, 1))
     if x * y * z > _MOST_SAMPLES:
-        raise ValueError(f"resolution is {resolution} m: {x * y * z} samples are too many")
+        raise ValueError(
+            f"resolution is {resolution} m, which needs {x * y * z} samples, expected at most "
+            f"{_MOST_SAMPLES}"
+        )
     return x, y, z
 
 
@@ -42,18 +69,12 @@ def check_resolution(resolution: float) -> None:
         raise ValueError(f"resolution is {resolution} m, expected > 0")
 
 
-def bounds(baked: Baked) -> tuple[jax.Array, jax.Array]:
-    """The corners of the box that a baked field covers, (3,) m each, world frame."""
-    last = jnp.asarray(baked.sdf.shape, jnp.float32) - 1
-    return baked.corner_world, baked.corner_world + last * baked.resolution
-
-
 def interpolate(baked: Baked, values: jax.Array, points_world: jax.Array) -> jax.Array:
     """Interpolates samples trilinearly.
 
     Args:
         baked: The baked field.
-        values: (X, Y, Z), one of its arrays.
+        values: One of its arrays, (X, Y, Z).
         points_world: (..., 3) m, inside its box.
 
     Returns:

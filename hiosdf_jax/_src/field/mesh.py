@@ -16,24 +16,27 @@ from hiosdf_jax._src.state import Field, MapState
 if TYPE_CHECKING:
     import trimesh
 
-# One batch shape for every query: the map compiles once, and memory does not grow with the map.
+# One batch shape for every query: one compilation, and memory does not grow with the map.
 _CHUNK = 65536
 _NOT_ZERO = 1e-6  # m
 
 
 def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.Trimesh:
-    """Extracts the zero level set of a map, where the map has been observed.
+    """Extracts the zero level set of a map in observed space.
 
     Args:
         field: A map or a snapshot of one.
-        resolution: Spacing of the samples that the mesh is made from, m.
+        resolution: Spacing of the samples, m.
 
     Returns:
-        The mesh, m, world frame, with normals that point to free space; one without faces if the
-        map shows no surface.
+        The mesh, m, world frame, with normals that point to free space; without faces if the map
+        shows no surface.
 
     Raises:
         ValueError: The resolution is not positive.
+
+    Example:
+        >>> hio.extract_mesh(field, resolution=0.05).export("mesh.ply")
     """
     check_resolution(resolution)
     low, high = np.asarray(field.config.bounds)
@@ -41,14 +44,13 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     count = math.prod(shape)
     sdf, observed = np.empty(count, np.float32), np.empty(count, bool)
     for start in range(0, count, _CHUNK):
-        # The last sample repeated fills the last chunk up.
+        # The last sample is repeated to fill the last chunk.
         index = np.minimum(np.arange(start, start + _CHUNK), count - 1)
         points_world = low + resolution * np.stack(np.unravel_index(index, shape), axis=-1)
         values, seen = _sample(field, points_world.astype(np.float32))
-        # Written in full, the repeated ones with what they repeat.
         sdf[index], observed[index] = np.asarray(values), np.asarray(seen)
-    # Rays keep a margin before their end, so that between free space that was seen and the surface
-    # lies up to about a voxel that nothing is known of.
+    # Passes stop before the end of a ray, so up to about a voxel of unknown space lies between
+    # observed free space and the surface.
     reach = max(1, math.ceil(field.config.voxel_size / resolution - 1e-6))
     return mesh_from_samples(sdf.reshape(shape), observed.reshape(shape), low, resolution, reach)
 
@@ -60,21 +62,21 @@ def mesh_from_samples(
     resolution: float,
     reach: int = 1,
 ) -> trimesh.Trimesh:
-    """Turns samples of a distance field on a grid into the mesh of its zero level set.
+    """Extracts the zero level set of a sampled distance field.
 
     Args:
         sdf: (X, Y, Z) m, positive in free space; NaN counts as not observed.
         observed: (X, Y, Z) bool.
-        corner_world: (3,) m, the position of sample (0, 0, 0).
-        resolution: Distance between neighbouring samples, m.
-        reach: The surface is drawn up to this many samples from those observed to be free.
+        corner_world: Position of sample (0, 0, 0), (3,) m.
+        resolution: Spacing of the samples, m.
+        reach: The surface is extracted up to this many samples from observed free space.
 
     Returns:
-        The mesh, m, world frame, with normals that point to free space; one without faces if no
-        surface was observed.
+        The mesh, m, world frame, with normals that point to free space; without faces if no surface
+        was observed.
 
     Raises:
-        ValueError: The resolution or the reach is not positive, or an array is misshapen.
+        ValueError: The resolution or the reach is not positive, or an array has a wrong shape.
     """
     import scipy.ndimage
     import skimage.measure
@@ -93,12 +95,12 @@ def mesh_from_samples(
         raise ValueError(f"corner_world has shape {corner_world.shape}, expected (3,)")
 
     known = np.isfinite(sdf)
-    # A sample of exactly 0 would make triangles without area, with all corners on one spot.
+    # A sample of exactly 0 would make triangles without area.
     values = np.where(known, np.where(sdf == 0, _NOT_ZERO, sdf), 1)
-    # A surface is seen from free space. Starting from all that was observed would also draw the
-    # step from "behind a wall" to what the map guesses beyond: a second wall that nobody saw.
+    # A surface is seen from free space. Starting from all observed space would also extract the
+    # step from "behind a wall" to the map's guess beyond it: a second wall that nobody saw.
     near = scipy.ndimage.maximum_filter(observed & known & (values > 0), size=2 * reach + 1)
-    # skimage draws the cell between samples i and i + 1 where mask[i + 1]; here all eight must do.
+    # skimage uses the cell between samples i and i + 1 where mask[i + 1]; here all eight must hold.
     mask = np.zeros(sdf.shape, bool)
     mask[1:, 1:, 1:] = True
     near &= known
@@ -110,7 +112,7 @@ def mesh_from_samples(
         vertices, faces, _, _ = skimage.measure.marching_cubes(
             values, 0.0, mask=mask, gradient_direction="descent"
         )
-    except RuntimeError:  # values on both sides of 0, but not in one cell that is drawn
+    except RuntimeError:  # values on both sides of 0, but not within one cell
         return trimesh.Trimesh()
     return trimesh.Trimesh(vertices * resolution + corner_world, faces, process=False)
 
@@ -118,4 +120,4 @@ def mesh_from_samples(
 @jax.jit
 def _sample(field: MapState | Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
     answer = query(field, points_world)
-    return answer.sdf, answer.observed  # the gradient is not used, so that XLA leaves it out
+    return answer.sdf, answer.observed  # XLA drops the unused gradient

@@ -1,18 +1,18 @@
-"""What a planner asks the map: distances, gradients, and how far what it has seen reaches."""
+"""Queries at points: distances, gradients, the frontier and lower bounds."""
 
 from __future__ import annotations
 
 import functools
-from typing import Any, Literal
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.field import blend, lattice
-from hiosdf_jax._src.grid import geometry, lookup
-from hiosdf_jax._src.mapping import calibration
+from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.state import Baked, Field, MapState, Query
+from hiosdf_jax._src.state import Baked, Field, MapState, Query, field_of
 
 _FAR = 1e30  # m
 
@@ -21,23 +21,25 @@ Unknown = Literal["network", "obstacle"]
 
 
 def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array:
-    """Signed distance to the nearest surface.
+    """Computes the signed distance to the nearest surface.
 
-    Outside the bounds it is the distance to the box plus the value at the box's nearest point; for
-    a point with a NaN it is -1e30, so that a rollout that has diverged is not taken for safe.
+    Outside the bounds it is the distance to the box plus the value at the box's nearest point. NaN
+    points return -1e30, i.e. in collision, so that a diverged rollout is never safe.
 
     Args:
-        field: A map, a snapshot of one, or a baked snapshot.
+        field: A map, a snapshot of one, or a baked field.
         points: (..., 3) m, world frame.
-        unknown: What to make of space that no ray has reached: "network", whatever the map
-            predicts there; "obstacle", a solid body: the least of the distances to surfaces and
-            to unseen space.
+        unknown: Policy for unseen space. "network" returns the map's prediction there. "obstacle"
+            treats unseen space as solid: the result is min(sdf, frontier).
 
     Returns:
         (...) float32, m; positive in free space, negative behind surfaces. Differentiable.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: An argument has a wrong type, shape or value.
+
+    Example:
+        >>> clearance = hio.sdf(field, points, unknown="obstacle") - robot_radius
     """
     return _distance(as_field(field), _checked(points, unknown), unknown)
 
@@ -45,10 +47,10 @@ def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array
 def sdf_and_grad(
     field: AnyField, points: Any, unknown: Unknown = "network"
 ) -> tuple[jax.Array, jax.Array]:
-    """Signed distance and its gradient, by one backward pass for the whole batch.
+    """Computes the signed distance and its gradient with one backward pass for the whole batch.
 
     Args:
-        field: A map, a snapshot of one, or a baked snapshot.
+        field: A map, a snapshot of one, or a baked field.
         points: (..., 3) m, world frame.
         unknown: As for `sdf`.
 
@@ -56,39 +58,45 @@ def sdf_and_grad(
         The distance (...) float32, m, and d(sdf)/d(point), (..., 3) float32. Differentiable.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: An argument has a wrong type, shape or value.
+
+    Example:
+        >>> distance, gradient = hio.sdf_and_grad(field, points)
     """
     return _distance_and_grad(as_field(field), _checked(points, unknown), unknown)
 
 
 def query(field: AnyField, points: Any, unknown: Unknown = "network") -> Query:
-    """All that the map knows of points.
+    """Computes everything that the map knows of points.
 
     Args:
-        field: A map, a snapshot of one, or a baked snapshot.
+        field: A map, a snapshot of one, or a baked field.
         points: (..., 3) m, world frame.
-        unknown: As for `sdf`; it changes `sdf` and `grad` of the answer alone.
+        unknown: As for `sdf`; it affects only `sdf` and `grad` of the answer.
 
     Returns:
         The answer. Points outside the bounds are not observed.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: An argument has a wrong type, shape or value.
+
+    Example:
+        >>> safe = hio.query(field, points).lower > robot_radius
     """
     return _query(as_field(field), _checked(points, unknown), unknown)
 
 
 def as_field(field: AnyField) -> Field | Baked:
-    """Takes what queries read out of a map, without a copy.
+    """Selects what queries read, without a copy.
 
     Args:
-        field: A map, a snapshot of one, or a baked snapshot.
+        field: A map, a snapshot of one, or a baked field.
 
     Returns:
-        A field, or the baked snapshot itself.
+        A field or a baked field.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: The argument is something else.
     """
     if isinstance(field, Field | Baked):
         return field
@@ -97,33 +105,17 @@ def as_field(field: AnyField) -> Field | Baked:
     raise ValueError(f"field is {type(field).__name__}, expected a MapState, a Field or a Baked")
 
 
-def field_of(state: MapState) -> Field:
-    """What queries read out of a map, without a copy."""
-    return Field(
-        config=state.config,
-        params=state.network.served,
-        origin_world=state.network.origin_world,
-        surface=state.grid.surface,
-        optimism=state.optimism,
-        updates=state.updates,
-        stamp=jnp.zeros((), jnp.float32),
-    )
-
-
-# Compiled by themselves, so that a call outside jit is one dispatch.
+# Compiled functions of their own, so that a call outside jit is one dispatch.
 _compiled = functools.partial(jax.jit, static_argnames="unknown")
 
 
 @_compiled
 def _query(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
     value, gradient = _distance_and_grad(field, points, unknown)
-    frontier = _frontier(field, points)
-    inside, beyond = _split(field, points)
-    if isinstance(field, Baked):
-        lower = lattice.interpolate(field, field.lower, inside)
-    else:
-        lower = calibration.lower_bound(field, inside)
-    return Query(value, gradient, frontier > 0, frontier, lower - beyond)
+    place = _place(field, points)
+    frontier = _frontier(field, place)
+    lower = _answers_of(field).lower(field, place.nearest) - place.beyond
+    return Query(value, gradient, frontier > 0, frontier, lower)
 
 
 @_compiled
@@ -135,39 +127,41 @@ def _distance_and_grad(
 
 @_compiled
 def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown) -> jax.Array:
-    inside, beyond = _split(field, points)
-    if isinstance(field, Baked):
-        value = lattice.interpolate(field, field.sdf, inside)
-    else:
-        value = blend.served_sdf(field, inside)
-    # A point that is no point is nowhere safe: as deep inside as others are far outside.
-    nowhere = jnp.any(jnp.isnan(points), axis=-1)
-    value = value + jnp.where(nowhere, -beyond, beyond)
-    return value if unknown == "network" else jnp.minimum(value, _frontier(field, points))
+    place = _place(field, points)
+    value = _answers_of(field).sdf(field, place.nearest)
+    value = value + jnp.where(jnp.any(jnp.isnan(points), axis=-1), -place.beyond, place.beyond)
+    return value if unknown == "network" else jnp.minimum(value, _frontier(field, place))
 
 
-def _frontier(field: Field | Baked, points: jax.Array) -> jax.Array:
-    inside, beyond = _split(field, points)
-    if isinstance(field, Baked):
-        value = lattice.interpolate(field, field.frontier, inside)
-    else:
-        value = lookup.frontier(field.config, field.surface, inside)
-    # Nothing outside the bounds has been seen, and the bounds themselves are the last of what has.
-    return jnp.where(beyond > 0, jnp.minimum(value, 0) - beyond, value)
+class _Place(NamedTuple):
+    """Points relative to the field's box."""
+
+    nearest: jax.Array  # (..., 3) m, the nearest points of the box
+    beyond: jax.Array  # (...) m, the distances to it
 
 
-def _split(field: Field | Baked, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The nearest points of the box, (..., 3) m, and the distances to it, (...) m."""
-    low, high = lattice.bounds(field) if isinstance(field, Baked) else field.config.bounds
+def _answers_of(field: Field | Baked) -> ModuleType:
+    """Chooses the module that answers for this kind of field."""
+    return lattice if isinstance(field, Baked) else blend
+
+
+def _frontier(field: Field | Baked, place: _Place) -> jax.Array:
+    value = _answers_of(field).frontier(field, place.nearest)
+    # Space outside the bounds is unseen.
+    return jnp.where(place.beyond > 0, jnp.minimum(value, 0) - place.beyond, value)
+
+
+def _place(field: Field | Baked, points: jax.Array) -> _Place:
+    low, high = _answers_of(field).bounds(field)
     low, high = jnp.asarray(low, points.dtype), jnp.asarray(high, points.dtype)
     points = jnp.where(jnp.isnan(points), _FAR, points)
-    nearest = geometry.clip_to_box(points, low, high)
+    nearest = clip_to_box(points, low, high)
     beyond = points - nearest
-    # Scaled by the largest component, since the square of a far point would overflow.
+    # Scaled by the largest component: the square of a far point would overflow.
     scale = jnp.maximum(jnp.max(jnp.abs(jax.lax.stop_gradient(beyond)), axis=-1), 1e-6)
     square = jnp.sum((beyond / scale[..., None]) ** 2, axis=-1)
     outside = square > 0
-    return nearest, jnp.where(outside, scale * jnp.sqrt(jnp.where(outside, square, 1)), 0)
+    return _Place(nearest, jnp.where(outside, scale * jnp.sqrt(jnp.where(outside, square, 1)), 0))
 
 
 def _checked(points: Any, unknown: Any) -> jax.Array:
@@ -176,5 +170,5 @@ def _checked(points: Any, unknown: Any) -> jax.Array:
     points = jnp.asarray(points)
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points has shape {points.shape}, expected (..., 3)")
-    # Infinite points are taken as very far ones: inf - inf would be NaN.
+    # Infinite points count as very far: inf - inf would be NaN.
     return jnp.clip(points.astype(jnp.float32), -_FAR, _FAR)

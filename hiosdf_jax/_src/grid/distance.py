@@ -1,7 +1,7 @@
 """The distance transform: every voxel's nearest surface patch, and its side of it.
 
-Three separable passes, one an axis, each the exact minimum over all sites within the horizon of a
-squared distance; the sites lie at their patch's centre, not at their voxel's.
+One exact transform per axis: the minimum over all sites within the horizon of a squared distance.
+A site lies at the center of its patch, not at that of its voxel.
 """
 
 from __future__ import annotations
@@ -14,26 +14,24 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.grid.change import Change, Window, recompute
+from hiosdf_jax._src.grid.windows import RayBox, Window, recompute
+from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
-from hiosdf_jax._src.state import Grid, Surface
-
-NO_FEATURE = -128
-"""`Surface.nearest` where there is no feature within the horizon."""
+from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid
 
 _INFINITE = 1e12  # squared voxels
 
-# A voxel is free if at least this many rays went through it for each that ended just before it:
-# noise puts some ends of rays too far.
+# A voxel is free with at least this many passes per ray that ended just before it: noise puts some
+# ends of rays too far away.
 _FREE_RATIO = 0.1
 
-# How far behind a patch free space makes it a sheet: beyond the margin that passes keep, voxels.
+# Free space this far behind a patch makes it a sheet: beyond the margin of the passes, voxels.
 _SHEET_VOXELS = 2.0
 
-# Where no ray came by, the plane of a patch tells its side up to here, voxels.
+# Where no ray passed, the plane of a patch decides the side up to this distance, voxels.
 _GUESS_VOXELS = 3.0
 
-# Shifts in either direction that a pass tries at a time.
+# Shifts in either direction between two optimization barriers.
 _CHUNK = 8
 
 
@@ -42,7 +40,7 @@ class Part(NamedTuple):
 
     Attributes:
         start: Its first voxel, three int32 scalars.
-        shape: Static.
+        shape: Its shape, static.
     """
 
     start: tuple[jax.Array | int, ...]
@@ -56,40 +54,40 @@ def nearest_sites(
     part: Part | None = None,
     order: Sequence[int] = (2, 1, 0),
 ) -> tuple[jax.Array, jax.Array]:
-    """Finds each voxel's nearest site by exact passes over the axes.
+    """Finds each voxel's nearest site by one exact transform per axis.
 
     Args:
-        sites: (X, Y, Z) bool, the voxels that hold a site.
-        offset: (X, Y, Z, 3) of the site from its voxel's centre, voxels, in [-0.5, 0.5].
-        horizon: Sites farther than this along an axis are not looked for, voxels.
-        part: The voxels to find them for; by default all.
-        order: Of the passes. Each one cuts the box down to the part along its axis. Where sites lie
-            off their voxels' centres the answer can depend on it.
+        sites: Mask of the voxels that hold a site, (X, Y, Z) bool.
+        offset: Offset of the site from its voxel's center, (X, Y, Z, 3) voxels, in [-0.5, 0.5].
+        horizon: Largest distance along an axis, voxels.
+        part: The voxels to find sites for; all by default.
+        order: Order of the axes. Each transform cuts the box down to the part along its axis. The
+            result can depend on the order where sites lie off their voxels' centers.
 
     Returns:
-        nearest: (A, B, C) int32, the flat index of the nearest site's voxel; -1 where none is
-            within the horizon. Of the part's shape.
-        squared: (A, B, C) squared distance of the voxel's centre to it, voxels^2.
+        nearest: Flat index of the nearest site's voxel, (A, B, C) int32, of the part's shape; -1
+            where none is within the horizon.
+        squared: Squared distance of the voxel's center to it, (A, B, C) voxels^2.
     """
     start, shape = part or Part((0, 0, 0), sites.shape)
     nearest = jnp.arange(sites.size, dtype=jnp.int32).reshape(sites.shape)
     squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
     for axis in order:
-        # A voxel's candidate lies at some other place along this axis.
+        # A voxel's candidate lies at another place along this axis.
         along = offset[..., axis].ravel()[nearest.ravel()].reshape(nearest.shape)
-        squared, shift = _pass(squared, along, axis, horizon, start[axis], shape[axis])
+        squared, shift = _transform_axis(squared, along, axis, horizon, start[axis], shape[axis])
         row = jax.lax.broadcasted_iota(jnp.int32, shift.shape, axis) + start[axis] + shift
         nearest = jnp.take_along_axis(nearest, row, axis)
     found = squared <= horizon**2
     return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
 
 
-def pass_order(config: Config) -> list[int]:
-    """Short axes first: of the grid, since all windows must give the same answer."""
+def axis_order(config: Config) -> list[int]:
+    """Returns the grid's axes, short ones first; all windows must use the same order."""
     return sorted(range(3), key=lambda k: config.grid_shape[k])
 
 
-def _pass(
+def _transform_axis(
     squared: jax.Array,
     along: jax.Array,
     axis: int,
@@ -97,33 +95,37 @@ def _pass(
     first: jax.Array | int,
     length: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Least distance over shifts of the candidates along an axis, for `length` voxels of it.
+    """Finds the least squared distance over shifts along an axis, for `length` voxels of it.
 
-    The candidate of a voxel k further on is at k + along from here, and its distance across the
+    The candidate of the voxel k further along is at k + along from here. Its distance across the
     axis is the same as there.
+
+    Args:
+        squared: Squared distance to each voxel's candidate, (X, Y, Z) voxels^2.
+        along: Offset of the candidate along the axis, (X, Y, Z) voxels.
+        axis: The axis.
+        horizon: Largest shift, voxels.
+        first: First voxel along the axis.
+        length: Voxels along the axis, static.
+
+    Returns:
+        The least squared distances and the shifts that give them, int32.
     """
     reach = min(horizon, squared.shape[axis] - 1)
-    margin = [(0, 0)] * 3
-    margin[axis] = (reach, reach)
-    across = jnp.pad(squared - along * along, margin, constant_values=_INFINITE)
-    along = jnp.pad(along, margin)
-
-    def part(array: jax.Array, size: int) -> jax.Array:
-        return jax.lax.dynamic_slice_in_dim(array, first, size, axis)
-
-    def shifted(array: jax.Array, shift: int) -> jax.Array:
-        return jax.lax.slice_in_dim(array, reach + shift, reach + shift + length, axis=axis)
-
-    # Cut out once, so that all the shifts are known to the compiler; and a few of them at a time:
-    # the barriers keep XLA from computing what they have in common for each shift again.
-    best = part(squared, length)
+    across_all = pad_axis(squared - along * along, axis, reach, _INFINITE).part(first, length)
+    along_all = pad_axis(along, axis, reach).part(first, length)
+    best = jax.lax.dynamic_slice_in_dim(squared, first, length, axis)
     shift = jnp.zeros(best.shape, jnp.int32)
-    across, along = jax.lax.optimization_barrier(
-        (part(across, length + 2 * reach), part(along, length + 2 * reach))
+    # The compiler knows all shifts. The barriers keep XLA from computing what they have in common
+    # again for each shift.
+    values = jax.lax.optimization_barrier((across_all.values, along_all.values))
+    across, along_axis = (
+        array._replace(values=value)
+        for array, value in zip((across_all, along_all), values, strict=True)
     )
     for k in range(1, reach + 1):
         for step in (-k, k):
-            candidate = shifted(across, step) + (step + shifted(along, step)) ** 2
+            candidate = across.shifted(step) + (step + along_axis.shifted(step)) ** 2
             shift = jnp.where(candidate < best, step, shift)
             best = jnp.minimum(best, candidate)
         if k % _CHUNK == 0 or k == reach:
@@ -131,49 +133,49 @@ def _pass(
     return best, shift
 
 
-def update_distances(config: Config, grid: Grid, change: Change) -> Grid:
+def update_distances(config: Config, grid: Grid, box: RayBox) -> Grid:
     """Recomputes distances and signs where new evidence can have changed them.
 
     Args:
         config: The map's configuration.
         grid: The grid, with new evidence.
-        change: Where that is.
+        box: The rays of the new evidence.
 
     Returns:
         The grid with nearest, sdf and doubt as if recomputed everywhere.
     """
     horizon_m = config.horizon_voxels * config.voxel_size
 
-    def inside(window: Window) -> Surface:
+    def inside(window: Window) -> Derived:
         return _distances_in(config, grid, window)
 
-    return grid.replace(surface=recompute(config, change, horizon_m, inside))
+    return grid.replace(derived=recompute(config, box, horizon_m, inside))
 
 
-def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
-    """The grid's surface with new distances in a window that holds all they can depend on."""
+def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
+    """Recomputes the distances in a window that holds all that they depend on."""
     start, shape, inner_start, inner = window
     within = window.within
     part = Part(within, inner)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)
         for array in (
-            grid.hits,
-            grid.passes,
-            grid.behind,
-            grid.surface.mean,
-            grid.surface.axes,
+            grid.evidence.hits,
+            grid.evidence.passes,
+            grid.evidence.behind,
+            grid.evidence.mean,
+            grid.evidence.axes,
         )
     )
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
-    order = pass_order(config)
+    order = axis_order(config)
     features = patches.is_feature(config, hits, passes, axes)
     nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part, order)
     doubtful = patches.is_doubtful(hits, passes)
     _, squared = nearest_sites(doubtful, mean, config.horizon_voxels, part, order)
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
 
-    # From the centres of the part's voxels to their nearest patches.
+    # From the centers of the part's voxels to their nearest patches.
     nearest = nearest.ravel()
     found, row = nearest >= 0, jnp.maximum(nearest, 0)
     here = jnp.unravel_index(jnp.arange(nearest.size, dtype=jnp.int32), inner)
@@ -184,26 +186,28 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Surface:
     patch = each(jnp.add, take(means, row), jump)
     offset = patches.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
     side = _side(is_free(passes, behind), behind, here, offset, middle, short)
-    metres = side * length(offset) * config.voxel_size
-    sdf = jnp.where(found, metres, config.distance_horizon)
+    signed_m = side * length(offset) * config.voxel_size
+    sdf = jnp.where(found, signed_m, config.distance_horizon)
     jump = jnp.where(found[..., None], join(jump), NO_FEATURE)
 
-    def put(old: jax.Array, values: jax.Array) -> jax.Array:
+    def write(old: jax.Array, values: jax.Array) -> jax.Array:
         values = values.reshape(*inner, *old.shape[3:]).astype(old.dtype)
         return geometry.write_window(old, inner_start, values)
 
-    known = grid.surface
+    known = grid.derived
     return known.replace(
-        nearest=put(known.nearest, jump), sdf=put(known.sdf, sdf), doubt=put(known.doubt, doubt)
+        nearest=write(known.nearest, jump),
+        sdf=write(known.sdf, sdf),
+        doubt=write(known.doubt, doubt),
     )
 
 
 def is_free(passes: jax.Array, behind: jax.Array) -> jax.Array:
-    """Tells the voxels that rays have shown to be free: a ray went through, and not by chance.
+    """Returns a mask of the voxels that rays have shown to be free.
 
     Args:
-        passes: (...) rays that went through the voxel.
-        behind: (...) rays that ended a little before it.
+        passes: Rays that went through the voxel, (...).
+        behind: Rays that ended a little before it, (...).
 
     Returns:
         (...) bool.
@@ -219,19 +223,19 @@ def _side(
     middle: Vector,
     short: Vector,
 ) -> jax.Array:
-    """Sign of voxels' centres: +1 in free space, -1 behind surfaces.
+    """Computes the sign of voxels' centers: +1 in free space, -1 behind surfaces.
 
-    Away from surfaces the rays through the voxel decide. Within a voxel of a flat patch the side
-    of its plane does, since rays end in such a voxel: unless the patch is a sheet, with free space
-    behind it as well.
+    Away from surfaces the rays through the voxel decide. Rays end within a voxel of a flat patch,
+    so there the side of its plane decides, unless the patch is a sheet with free space on both
+    sides.
 
     Args:
-        free: (X, Y, Z) bool, what `is_free` says of the window.
-        behind: (X, Y, Z) rays that ended a little before the window's voxels.
-        here: (N,) indices of the voxels in the window.
-        offset: (N,) from the nearest point of the nearest patch to the centre, voxels.
-        middle: (N,) the second principal axis of that patch.
-        short: (N,) its third, along the normal.
+        free: Result of `is_free` in the window, (X, Y, Z) bool.
+        behind: Rays that ended a little before the window's voxels, (X, Y, Z).
+        here: Indices of the voxels in the window, (N,) each.
+        offset: From the nearest point of the nearest patch to the center, (N,) each, voxels.
+        middle: The second principal axis of that patch, (N,) each.
+        short: Its third axis, along the normal, (N,) each.
 
     Returns:
         (N,) float32.
@@ -246,7 +250,7 @@ def _side(
     probe = each(lambda b, n: jnp.clip(jnp.round(b).astype(jnp.int32), 0, n - 1), beyond, shape)
     by_plane = in_front | free[geometry.flat_index(shape, probe)]
     own = geometry.flat_index(shape, here)
-    unmet = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
-    by_rays = jnp.where(behind[own] > 0, -1.0, unmet)
+    unobserved = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
+    by_rays = jnp.where(behind[own] > 0, -1.0, unobserved)
     by_rays = jnp.where(free[own], 1.0, by_rays)
     return jnp.where(flat & (distance < 1), jnp.where(by_plane, 1.0, -1.0), by_rays)

@@ -1,86 +1,115 @@
-"""What the rays leave in the grid: kept in float16, and added to in float32 around the sensor."""
+"""The evidence of rays: stored in float16, updated in float32 in a window around the sensor."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid import carving, geometry
-from hiosdf_jax._src.grid.distance import NO_FEATURE
-from hiosdf_jax._src.state import Grid, Surface
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
+from hiosdf_jax._src.state import FRONTIER_STEPS, NO_FEATURE, Derived, Evidence, Grid
 
-# Half the memory, and finer than the noise.
+# Half the memory of float32, and finer than the noise.
 _STORED = jnp.float16
 
-# Such numbers are at most 1 + 2^-11 = 1.0005 times what they were rounded from.
+# Rounding to float16 multiplies a number by at most 1 + 2^-11 = 1.0005.
 _ROUNDING = 1.0007
 
 
+class EvidenceWindow(NamedTuple):
+    """The evidence that one cloud can change.
+
+    Attributes:
+        start: First voxel of the window in the grid, (3,) int32.
+        hits: As in `Evidence`, (A, B, C) float32: one cloud may add more than float16 holds.
+        passes: As in `Evidence`, float32.
+        behind: As in `Evidence`, float32.
+        weight: Summed weights of the hits, float32.
+        mean: As in `Evidence`, float16.
+        axes: As in `Evidence`, float16.
+    """
+
+    start: jax.Array
+    hits: jax.Array
+    passes: jax.Array
+    behind: jax.Array
+    weight: jax.Array
+    mean: jax.Array
+    axes: jax.Array
+
+
 def empty_grid(config: Config) -> Grid:
-    """A grid that no ray has met."""
+    """Makes a grid that no ray has met."""
     shape = config.grid_shape
     return Grid(
-        hits=jnp.zeros(shape, _STORED),
-        passes=jnp.zeros(shape, _STORED),
-        behind=jnp.zeros(shape, _STORED),
-        weight=jnp.zeros(shape, _STORED),
-        surface=Surface(
+        evidence=Evidence(
+            hits=jnp.zeros(shape, _STORED),
+            passes=jnp.zeros(shape, _STORED),
+            behind=jnp.zeros(shape, _STORED),
+            root_weight=jnp.zeros(shape, _STORED),
             mean=jnp.zeros((*shape, 3), _STORED),
             axes=jnp.zeros((*shape, 3, 3), _STORED),
+        ),
+        derived=Derived(
             nearest=jnp.full((*shape, 3), NO_FEATURE, jnp.int8),
             sdf=jnp.full(shape, config.distance_horizon, _STORED),
             doubt=jnp.full(shape, config.distance_horizon, _STORED),
-            frontier=jnp.full(shape, -geometry.FRONTIER_STEPS, jnp.int8),
+            frontier=jnp.full(shape, -FRONTIER_STEPS, jnp.int8),
         ),
     )
 
 
-def read_evidence(config: Config, grid: Grid, sensor_world: jax.Array) -> tuple[jax.Array, Grid]:
-    """Cuts out what a cloud can change, so that the work does not grow with the map.
+def read_window(config: Config, evidence: Evidence, rays: Rays) -> EvidenceWindow:
+    """Reads the evidence within reach of the sensor, so that the work does not grow with the map.
 
     Args:
         config: The map's configuration.
-        grid: The grid.
-        sensor_world: (3,) m.
+        evidence: The evidence of the whole grid.
+        rays: The cloud.
 
     Returns:
-        start: (3,) int32, the window's first voxel.
-        window: The grid within reach of the sensor; what the rays count in float32, since one
-            cloud may add more than float16 holds, and `weight` squared.
+        The window.
     """
-    shape = geometry.window_shape(
-        config, config.max_range + carving.HIDDEN_VOXELS * config.voxel_size
+    reach = config.max_range + HIDDEN_VOXELS * config.voxel_size
+    shape = geometry.window_shape(config, reach)
+    start = geometry.window_start(config, shape, rays.sensor_world)
+
+    def read(array: jax.Array) -> jax.Array:
+        return geometry.read_window(array, start, shape)
+
+    return EvidenceWindow(
+        start=jnp.stack(start),
+        hits=read(evidence.hits).astype(jnp.float32),
+        passes=read(evidence.passes).astype(jnp.float32),
+        behind=read(evidence.behind).astype(jnp.float32),
+        weight=read(evidence.root_weight).astype(jnp.float32) ** 2,
+        mean=read(evidence.mean),
+        axes=read(evidence.axes),
     )
-    start = geometry.window_start(config, shape, sensor_world)
-    window = jax.tree.map(lambda array: geometry.read_window(array, start, shape), grid)
-    return jnp.stack(start), window.replace(
-        hits=window.hits.astype(jnp.float32),
-        passes=window.passes.astype(jnp.float32),
-        behind=window.behind.astype(jnp.float32),
-        weight=window.weight.astype(jnp.float32) ** 2,
-    )
 
 
-def fade_evidence(config: Config, window: Grid) -> Grid:
-    """Lets old evidence fade so that a voxel remembers `evidence_limit` rays.
+def fade_evidence(config: Config, window: EvidenceWindow) -> EvidenceWindow:
+    """Scales evidence down so that a voxel remembers at most `evidence_limit` rays.
 
-    That bounds how long a surface that has vanished, or appeared, has to be seen to be believed.
+    This bounds how many scans a vanished or a new surface needs to change the map.
 
     Args:
         config: The map's configuration.
-        window: The grid, or the part of it that has new evidence.
+        window: The window with new evidence.
 
     Returns:
         The window with scaled hits, weight, passes and behind.
     """
-    # As they will be stored: what rounding adds then is not taken for new evidence the next time,
-    # so that nothing fades where no ray comes by.
+    # Compared as stored: rounding must not count as new evidence at the next update, so that
+    # nothing fades where no ray passes.
     hits, passes = (_rounded(counts) for counts in (window.hits, window.passes))
     above = hits + passes > _ROUNDING * config.evidence_limit
     total = jnp.maximum(window.hits + window.passes, 1)
     scale = jnp.where(above, config.evidence_limit / total, 1)
-    return window.replace(
+    return window._replace(
         hits=window.hits * scale,
         weight=window.weight * scale,
         passes=window.passes * scale,
@@ -88,34 +117,44 @@ def fade_evidence(config: Config, window: Grid) -> Grid:
     )
 
 
+def is_observed(passes: jax.Array, hits: jax.Array) -> jax.Array:
+    """Returns a mask of the voxels that a ray has reached.
+
+    Args:
+        passes: Rays that went through the voxel, (...).
+        hits: Rays that ended in it, (...).
+
+    Returns:
+        (...) bool.
+    """
+    return (passes > 0) | (hits > 0)
+
+
 def _rounded(values: jax.Array) -> jax.Array:
-    """What storing will make of them; converting there and back may be simplified away."""
+    """Rounds as storing does; XLA may simplify a conversion there and back away."""
     kind = jnp.finfo(_STORED)
     return jax.lax.reduce_precision(values, kind.nexp, kind.nmant)
 
 
-def write_evidence(grid: Grid, start: jax.Array, window: Grid) -> Grid:
-    """Puts the window back; weights as their roots, since those of far returns are very small.
+def write_window(evidence: Evidence, window: EvidenceWindow) -> Evidence:
+    """Writes a window back.
 
     Args:
-        grid: The grid that it was cut from.
-        start: (3,) int32, the window's first voxel.
-        window: The window with new hits, passes, behind, weight, mean and axes.
+        evidence: The evidence of the whole grid.
+        window: The window with new evidence.
 
     Returns:
-        The grid.
+        The evidence with the window's values, rounded to float16.
     """
 
-    def put(old: jax.Array, values: jax.Array) -> jax.Array:
-        return geometry.write_window(old, tuple(start), values.astype(old.dtype))
+    def write(old: jax.Array, values: jax.Array) -> jax.Array:
+        return geometry.write_window(old, tuple(window.start), values.astype(old.dtype))
 
-    return grid.replace(
-        hits=put(grid.hits, window.hits),
-        passes=put(grid.passes, window.passes),
-        behind=put(grid.behind, window.behind),
-        weight=put(grid.weight, jnp.sqrt(window.weight)),
-        surface=grid.surface.replace(
-            mean=put(grid.surface.mean, window.surface.mean),
-            axes=put(grid.surface.axes, window.surface.axes),
-        ),
+    return Evidence(
+        hits=write(evidence.hits, window.hits),
+        passes=write(evidence.passes, window.passes),
+        behind=write(evidence.behind, window.behind),
+        root_weight=write(evidence.root_weight, jnp.sqrt(window.weight)),
+        mean=write(evidence.mean, window.mean),
+        axes=write(evidence.axes, window.axes),
     )

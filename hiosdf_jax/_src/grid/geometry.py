@@ -1,8 +1,8 @@
-"""Voxels and metres: the lattice, windows of the grid, the eight voxels around a point.
+"""Voxels and meters: voxel indices, windows of the grid, the eight voxels around a point.
 
-Voxel i of the lattice covers [i, i + 1) * voxel_size along an axis of the world frame; the grid
-holds the lattice's voxels from `config.corner_index` on. Which voxel a point falls in does
-therefore not depend on the bounds, and a grown map answers bit by bit as before.
+Voxel i covers [i, i + 1) * voxel_size along an axis of the world frame. The grid holds the voxels
+from `config.corner_index` on. The voxel of a point therefore does not depend on the bounds, and a
+grown map answers bit by bit as before.
 """
 
 from __future__ import annotations
@@ -17,14 +17,6 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.vectors import Vector, each, split
 
-FRONTIER_STEPS = 127
-"""`Surface.frontier` counts steps, so many to the horizon."""
-
-
-def frontier_step_m(config: Config) -> float:
-    """The length of such a step, m."""
-    return config.frontier_horizon / FRONTIER_STEPS
-
 
 def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the voxels that contain points.
@@ -35,33 +27,33 @@ def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Ar
 
     Returns:
         index: (..., 3) int32 into the grid; the nearest voxel for points outside.
-        offset: (..., 3) from the voxel's centre, voxels, in [-0.5, 0.5) for points inside.
+        offset: (..., 3) from the voxel's center, voxels, in [-0.5, 0.5) for points inside.
         inside: (...) bool; False for a point with a NaN.
     """
-    lattice = points_world / config.voxel_size
-    corner = jnp.asarray(config.corner_index, lattice.dtype)
-    shape = jnp.asarray(config.grid_shape, lattice.dtype)
+    points = points_world / config.voxel_size  # voxels
+    corner = jnp.asarray(config.corner_index, points.dtype)
+    shape = jnp.asarray(config.grid_shape, points.dtype)
     # Compared as floats: a far point would overflow an int32.
-    cell = jnp.floor(lattice) - corner
+    cell = jnp.floor(points) - corner
     inside = jnp.all((cell >= 0) & (cell < shape), axis=-1)
     cell = jnp.clip(cell, 0, shape - 1)
-    offset = lattice - (cell + corner) - 0.5
+    offset = points - (cell + corner) - 0.5
     return jnp.nan_to_num(cell).astype(jnp.int32), offset, inside
 
 
 def voxel_of_window(
     config: Config, start: jax.Array, shape: tuple[int, ...], points_world: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Finds the voxels of a part of the grid that contain points.
+    """Finds the voxels of a window that contain points.
 
     Args:
         config: The map's configuration.
-        start: (3,) int32, the part's first voxel.
-        shape: Its shape.
+        start: First voxel of the window, (3,) int32.
+        shape: Shape of the window.
         points_world: (..., 3) m.
 
     Returns:
-        As `voxel_of`, for that part; indices of points outside of it mean nothing.
+        As `voxel_of`, relative to the window; indices of points outside of it are undefined.
     """
     index, offset, inside = voxel_of(config, points_world)
     index = index - start
@@ -70,7 +62,7 @@ def voxel_of_window(
 
 
 def voxel_center(config: Config, index: jax.Array) -> jax.Array:
-    """Finds the centres of voxels.
+    """Computes the centers of voxels.
 
     Args:
         config: The map's configuration.
@@ -79,22 +71,22 @@ def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     Returns:
         (..., 3) m, world frame.
     """
-    lattice = index + jnp.asarray(config.corner_index, jnp.int32)
-    return (lattice.astype(jnp.float32) + 0.5) * config.voxel_size
+    index_world = index + jnp.asarray(config.corner_index, jnp.int32)
+    return (index_world.astype(jnp.float32) + 0.5) * config.voxel_size
 
 
 def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:
-    """Turns indices of an array of this shape, (...) each, into those of the raveled one, (...)."""
+    """Converts indices (...) into an array of this shape to indices into the raveled array."""
     return (index[0] * shape[1] + index[1]) * shape[2] + index[2]
 
 
 class Corners(NamedTuple):
-    """The eight voxels whose centres surround points, with the weights of trilinear interpolation.
+    """The eight voxels whose centers surround points, with trilinear interpolation weights.
 
     Attributes:
-        index: (..., 8) int32 each, as into the grid; at the border some lie beyond it.
-        flat: (..., 8) int32 into the raveled grid, of the nearest voxel for those beyond it.
-        inside: (..., 8) bool.
+        index: Voxel indices, (..., 8) int32 each; at the border some lie beyond the grid.
+        flat: Indices into the raveled grid, (..., 8) int32; the nearest voxel for those beyond.
+        inside: The voxel lies in the grid, (..., 8) bool.
         weight: (..., 8), adding up to 1.
     """
 
@@ -104,12 +96,12 @@ class Corners(NamedTuple):
     weight: jax.Array
 
 
-# Of each axis: whether a corner is the upper one along it.
+# For each axis, whether a corner is the upper one along it.
 _UPPER = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32).T
 
 
 def corners_of(config: Config, points_world: jax.Array) -> Corners:
-    """Finds the eight voxels whose centres surround points.
+    """Finds the eight voxels whose centers surround points.
 
     Args:
         config: The map's configuration.
@@ -119,14 +111,14 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
         The corners; the first is the lowest along all axes.
     """
 
-    def along(lattice: jax.Array, first: int, upper: np.ndarray) -> tuple[jax.Array, jax.Array]:
-        base = jnp.floor(lattice)
-        fraction = (lattice - base)[..., None]
+    def along(points: jax.Array, first: int, upper: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        base = jnp.floor(points)
+        fraction = (points - base)[..., None]
         index = (base.astype(jnp.int32) - first)[..., None] + upper
         return index, jnp.where(upper == 1, fraction, 1 - fraction)
 
-    lattice = split(points_world / config.voxel_size - 0.5)
-    parts = [along(*axis) for axis in zip(lattice, config.corner_index, _UPPER, strict=True)]
+    points = split(points_world / config.voxel_size - 0.5)
+    parts = [along(*axis) for axis in zip(points, config.corner_index, _UPPER, strict=True)]
     index = (parts[0][0], parts[1][0], parts[2][0])
     nearest = each(lambda i, n: jnp.clip(i, 0, n - 1), index, config.grid_shape)
     x, y, z = each(jnp.equal, index, nearest)
@@ -135,21 +127,21 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
 
 
 def clamp(config: Config, points_world: jax.Array) -> jax.Array:
-    """Moves (..., 3) points outside the bounds, m, to the nearest point of the box."""
+    """Clamps (..., 3) points, m, to the bounds."""
     low, high = jnp.asarray(config.bounds, points_world.dtype)
     return clip_to_box(points_world, low, high)
 
 
 def clip_to_box(points: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Moves (..., 3) points outside a box to its nearest point.
+    """Clamps (..., 3) points to a box, with the whole gradient on its faces.
 
-    Unlike jnp.clip, which halves the gradient on the faces.
+    (`jnp.clip` halves the gradient there.)
     """
     return jnp.where(points < low, low, jnp.where(points > high, high, points))
 
 
 def window_shape(config: Config, reach: float) -> tuple[int, int, int]:
-    """Shape of the part of the grid within `reach` metres of a point, along the axes."""
+    """Computes the shape of the window within `reach` (m) of a point along each axis."""
     span = 2 * math.ceil(reach / config.voxel_size) + 1
     x, y, z = config.grid_shape
     return (min(x, span), min(y, span), min(z, span))
@@ -158,15 +150,15 @@ def window_shape(config: Config, reach: float) -> tuple[int, int, int]:
 def window_start(
     config: Config, shape: tuple[int, int, int], center_world: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """First voxel of the window of this shape around a point, moved to lie inside the grid.
+    """Places a window around a point, moved to lie inside the grid.
 
     Args:
         config: The map's configuration.
-        shape: Of the window, no larger than the grid.
+        shape: Shape of the window, no larger than the grid.
         center_world: (3,) m.
 
     Returns:
-        Three int32 scalars.
+        Its first voxel, three int32 scalars.
     """
     index, _, _ = voxel_of(config, center_world)
     room = jnp.asarray(config.grid_shape, jnp.int32) - jnp.asarray(shape, jnp.int32)
@@ -177,16 +169,16 @@ def window_start(
 def read_window(
     array: jax.Array, start: tuple[jax.Array, ...], shape: tuple[int, int, int]
 ) -> jax.Array:
-    """Cuts the window out of a grid array; axes after the third come along whole."""
+    """Reads a window of a grid array; axes after the third are read whole."""
     rest = array.shape[3:]
     return jax.lax.dynamic_slice(array, _full_start(start, rest), (*shape, *rest))
 
 
 def write_window(array: jax.Array, start: tuple[jax.Array, ...], values: jax.Array) -> jax.Array:
-    """Puts a window's values back into a grid array."""
+    """Writes a window of a grid array."""
     return jax.lax.dynamic_update_slice(array, values, _full_start(start, array.shape[3:]))
 
 
 def _full_start(start: tuple[jax.Array, ...], rest: tuple[int, ...]) -> tuple[jax.Array, ...]:
-    # Of one type: a plain 0 would be an int64 where the user has enabled those.
+    # All int32: a plain 0 would be an int64 under jax_enable_x64.
     return (*start, *(jnp.zeros((), jnp.int32) for _ in rest))

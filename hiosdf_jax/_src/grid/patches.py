@@ -1,8 +1,8 @@
-"""Hits become sub-voxel surface patches: running weighted mean and principal axes per voxel.
+"""Surface patches finer than a voxel: running weighted mean and principal axes of its hits.
 
-The spread of the hits in a voxel tells what lies in it: a disc-like one is a piece of a wall, a
-rod-like one a table leg, a ball a corner. Its principal axes are kept instead of a covariance
-matrix: they are what a query needs, and the matrix follows from them.
+The spread of the hits shows what lies in a voxel: a disc is a piece of a wall, a rod is a table
+leg, a ball is a corner. Principal axes are stored instead of a covariance matrix. Queries need the
+axes, and the matrix follows from them.
 """
 
 from __future__ import annotations
@@ -12,58 +12,49 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid.evidence import EvidenceWindow
+from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
-from hiosdf_jax._src.state import Grid
 
-# The half extent of a patch along a principal axis, in standard deviations: sqrt(3) for hits that
-# are uniform along it, and a little less since noise widens the spread. Measured: 0.60 cm instead
-# of 0.62 cm on a depth stream, 0.71 instead of 0.73 on a LiDAR stream.
+# Half extent of a patch along a principal axis, in standard deviations. Uniform hits have sqrt(3);
+# noise widens the spread, so it is a little less. Measured: 0.60 instead of 0.62 cm on a depth
+# stream, 0.71 instead of 0.73 cm on a LiDAR stream.
 _EXTENT_DEVIATIONS = 0.9 * 3**0.5
 
-# Axes shorter than this (voxels) are stored with it, so that a perfect plane keeps its normal.
+# Shorter axes (voxels) are stored with this length, so that a perfect plane keeps its normal.
 _LEAST_DEVIATION = 1e-3
 
-# Axes shorter than this (voxels), twice the least, have no direction but that of rounding.
+# The direction of shorter axes (voxels; twice the least) is rounding noise.
 _LEAST_DIRECTED = 2e-3
 
 _JACOBI_SWEEPS = 5
 
-# Patches smaller than this (voxels^2) are asked for as many hits as one of this area: stray returns
-# are small as well.
+# Smaller patches (voxels^2) need as many hits as a patch of this area: stray returns are small too.
 _LEAST_AREA = 0.2
 
-# Voxels whose rays ended in them at least this often may hold a surface, whatever else they say.
+# A voxel in which at least this share of the rays ended may hold a surface.
 _DOUBT_RATIO = 0.02
 
 
-def fuse_hits(
-    config: Config,
-    window: Grid,
-    start: jax.Array,
-    points_world: jax.Array,
-    valid: jax.Array,
-    sensor_world: jax.Array,
-) -> Grid:
+def fuse_hits(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWindow:
     """Merges the ends of rays into the surface statistics of their voxels.
 
     Args:
         config: The map's configuration.
-        window: The grid, or a part of it.
-        start: (3,) int32, that part's first voxel.
-        points_world: (N, 3) m.
-        valid: (N,) bool; other rows change nothing.
-        sensor_world: (3,) m.
+        window: The evidence around the sensor.
+        rays: The cloud; rows that do not end on a surface change nothing.
 
     Returns:
         The window with new hits, weight, mean and axes.
     """
+    start, points_world, sensor_world = window.start, rays.points_world, rays.sensor_world
     count = points_world.shape[0]
     shape = window.hits.shape
     voxels = shape[0] * shape[1] * shape[2]
     index, offset, inside = geometry.voxel_of_window(config, start, shape, points_world)
-    voxel = jnp.where(valid & inside, geometry.flat_index(shape, split(index)), voxels)
+    voxel = jnp.where(rays.ends & inside, geometry.flat_index(shape, split(index)), voxels)
 
-    # Rows of one voxel become neighbours, so that sums cost the cloud's size, not the grid's.
+    # Sorted by voxel, so that sums cost the size of the cloud and not that of the grid.
     order = jnp.argsort(voxel)
     voxel, offset = voxel[order], offset[order]
     first = jnp.concatenate([jnp.ones(1, bool), voxel[1:] != voxel[:-1]])
@@ -89,7 +80,7 @@ def fuse_hits(
     # Chan's rule merges the two means and covariances.
     old_hits, old_weight, old_mean, old_axes = (
         array.reshape(voxels, *array.shape[3:])[jnp.minimum(target, voxels - 1)].astype(jnp.float32)
-        for array in (window.hits, window.weight, window.surface.mean, window.surface.axes)
+        for array in (window.hits, window.weight, window.mean, window.axes)
     )
     old_spread = jnp.einsum("nki,nkj->nij", old_axes, old_axes)
     part = new_weight / jnp.maximum(old_weight + new_weight, 1e-30)
@@ -111,52 +102,52 @@ def fuse_hits(
         flat = array.reshape(voxels, *array.shape[3:])
         return flat.at[target].set(values.astype(array.dtype), mode="drop").reshape(array.shape)
 
-    return window.replace(
+    return window._replace(
         hits=put(window.hits, old_hits + new_hits),
         weight=put(window.weight, old_weight + new_weight),
-        surface=window.surface.replace(
-            mean=put(window.surface.mean, mean), axes=put(window.surface.axes, axes)
-        ),
+        mean=put(window.mean, mean),
+        axes=put(window.axes, axes),
     )
 
 
 def _face_sensor(deviation: jax.Array, direction: jax.Array, to_sensor: jax.Array) -> jax.Array:
     """Turns the last principal axis, the normal, to the sensor's side.
 
-    Two hits, or several on a line, do not tell it: then it is what the line leaves of the direction
-    to the sensor, since the surface was seen from there.
+    Hits on a line do not determine the normal. There it is the part of the direction to the sensor
+    that is perpendicular to the line, since the surface was seen from there.
 
     Args:
-        deviation: (N, 3) along the axes, descending, voxels.
-        direction: (N, 3, 3) the axes, unit vectors as rows.
+        deviation: Standard deviations along the axes, descending, (N, 3) voxels.
+        direction: The axes, unit vectors as rows, (N, 3, 3).
         to_sensor: (N, 3) voxels.
 
     Returns:
-        (N, 3, 3) the axes.
+        The axes, (N, 3, 3).
     """
     along = jnp.sum(direction * to_sensor[:, None, :], axis=-1)
-    told = deviation >= _LEAST_DIRECTED
+    directed = deviation >= _LEAST_DIRECTED
     faces_away = along[:, 2:] < 0
     first, normal = direction[:, 0], jnp.where(faces_away, -1.0, 1.0) * direction[:, 2]
-    across = to_sensor - jnp.where(told[:, :1], along[:, :1], 0) * first
+    across = to_sensor - jnp.where(directed[:, :1], along[:, :1], 0) * first
     far = length(split(across))[:, None]
-    line = ~told[:, 1:2] & (far > 1e-3)
+    line = ~directed[:, 1:2] & (far > 1e-3)
     normal = jnp.where(line, across / jnp.maximum(far, 1e-3), normal)
     middle = jnp.where(line, jnp.cross(normal, first), direction[:, 1])
     return jnp.stack([first, middle, normal], axis=1)
 
 
 def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Array) -> jax.Array:
-    """Tells the voxels whose patch counts as surface: hit often enough, and seldom seen through.
+    """Returns a mask of the voxels whose patch counts as surface.
 
-    A patch that fills its voxel stops every ray, a leg or a pole lets most of them pass beside it:
-    what is asked for falls with the patch's area.
+    The voxel must have enough hits, and few passes. A patch that fills its voxel stops every ray; a
+    table leg lets most rays pass beside it. The required share of hits is therefore proportional to
+    the patch's area.
 
     Args:
         config: The map's configuration.
-        hits: (...) rays that ended in the voxel.
-        passes: (...) rays that went through it.
-        axes: (..., 3, 3) as in `Surface.axes`.
+        hits: Rays that ended in the voxel, (...).
+        passes: Rays that went through it, (...).
+        axes: As in `Evidence`, (..., 3, 3).
 
     Returns:
         (...) bool.
@@ -168,11 +159,11 @@ def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Arr
 
 
 def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
-    """Tells the voxels that may hold a surface: features, and those that are nearly ones.
+    """Returns a mask of the voxels that may hold a surface, with weaker demands.
 
     Args:
-        hits: (...) rays that ended in the voxel.
-        passes: (...) rays that went through it.
+        hits: Rays that ended in the voxel, (...).
+        passes: Rays that went through it, (...).
 
     Returns:
         (...) bool.
@@ -181,18 +172,18 @@ def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
 
 
 def patch_offset(point: Vector, mean: Vector, axes: tuple[Vector, Vector]) -> Vector:
-    """Vector from the nearest point of a patch to a point.
+    """Computes the vector from the nearest point of a patch to a point.
 
-    A patch is the rectangle around `mean` that the two longest principal axes span; rods and
-    single hits are the cases in which one or both of them are short.
+    A patch is the rectangle around `mean` that its two longest principal axes span. One or both
+    axes are short for rods and single hits.
 
     Args:
         point: Voxels.
-        mean: Centre of the patch, same frame and unit.
-        axes: The first two principal axes as in `Surface.axes`, voxels.
+        mean: Center of the patch, same frame and unit.
+        axes: The first two principal axes as in `Evidence`, voxels.
 
     Returns:
-        Voxels; its length is the distance.
+        The vector, voxels; its length is the distance.
     """
     offset = each(jnp.subtract, point, mean)
     for axis in axes:
@@ -204,17 +195,16 @@ def patch_offset(point: Vector, mean: Vector, axes: tuple[Vector, Vector]) -> Ve
 
 
 def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eigen-decomposition of symmetric 3x3 matrices by Jacobi rotations, in the batch's lanes.
+    """Decomposes symmetric 3x3 matrices by Jacobi rotations, vectorized over the batch.
 
-    (LAPACK and cuSOLVER take the matrices one by one: 160 ms for 40,000 of them on two cores,
-    where this takes 10.)
+    LAPACK and cuSOLVER process matrices one by one: 40,000 take 160 ms on two cores, 10 ms here.
 
     Args:
-        spread: (..., 3, 3) symmetric, positive semi-definite.
+        spread: Symmetric, positive semi-definite, (..., 3, 3).
 
     Returns:
-        deviation: (..., 3) square roots of the eigenvalues, descending.
-        direction: (..., 3, 3) unit eigenvectors as rows, in the same order.
+        deviation: Square roots of the eigenvalues, descending, (..., 3).
+        direction: Unit eigenvectors as rows, in the same order, (..., 3, 3).
     """
     a = {(i, j): spread[..., i, j] for i in range(3) for j in range(i, 3)}
     one, zero = jnp.ones_like(spread[..., 0, 0]), jnp.zeros_like(spread[..., 0, 0])

@@ -1,4 +1,4 @@
-"""A cloud as rays in the world: where they begin and end, and what they tell of."""
+"""A cloud as rays in the world frame."""
 
 from __future__ import annotations
 
@@ -11,18 +11,22 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.numerics.vectors import length, split
 
+HIDDEN_VOXELS = 4
+"""A ray changes no voxel farther than this behind its end."""
 
-class Beams(NamedTuple):
-    """A cloud as rays in the world.
+
+class Rays(NamedTuple):
+    """A cloud as rays from the sensor.
 
     Attributes:
-        points_world: (N, 3) m, where they end.
-        directions_world: (N, 3) unit vectors; 0 where there is no return.
-        free_ranges: (N,) m, the part of them that counts as free.
-        in_range: (N,) bool, finite and not nearer than min_range: tell of free space.
-        ends: (N,) bool, in range and not farther than max_range: tell of a surface.
-        inside: (N,) bool, end in the bounds.
-        sensor_world: (3,) m, where they begin.
+        points_world: End points, (N, 3) m.
+        directions_world: Unit vectors, (N, 3); 0 where there is no return.
+        free_ranges: Length of the part that counts as free space, (N,) m.
+        in_range: The return is finite and not nearer than min_range, (N,) bool; the ray clears
+            space.
+        ends: The return is in range and not farther than max_range, (N,) bool; it is on a surface.
+        inside: The end point lies in the bounds, (N,) bool.
+        sensor_world: Common origin, (3,) m.
     """
 
     points_world: jax.Array
@@ -34,8 +38,8 @@ class Beams(NamedTuple):
     sensor_world: jax.Array
 
 
-def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Beams:
-    """Takes a cloud to the world.
+def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Rays:
+    """Transforms a cloud to the world frame.
 
     Args:
         config: The map's configuration.
@@ -49,12 +53,12 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
     cloud = jnp.where(finite[:, None], cloud, 0)
     sensor_world = pose[:3, 3]
     offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
-    # Not the cloud's own: a pose that is rigid but for rounding must not take rays out of reach.
+    # Measured in the world: a pose that is rigid up to rounding must not move rays out of reach.
     ranges = length(split(offsets_world))
     in_range = finite & (ranges >= config.min_range)
     points_world = sensor_world + offsets_world
     _, _, inside = geometry.voxel_of(config, points_world)
-    return Beams(
+    return Rays(
         points_world=points_world,
         directions_world=offsets_world / jnp.maximum(ranges, 1e-6)[:, None],
         free_ranges=jnp.minimum(ranges, config.max_range),

@@ -1,4 +1,4 @@
-"""Mapping in a thread of its own, while a controller plans on the newest snapshot."""
+"""Mapping in a background thread, while a controller plans on the newest snapshot."""
 
 from __future__ import annotations
 
@@ -7,31 +7,33 @@ from typing import Any
 
 import jax
 
-from hiosdf_jax._src.field.points import field_of
 from hiosdf_jax._src.mapping.pipeline import update
-from hiosdf_jax._src.state import Field, MapState
+from hiosdf_jax._src.state import Field, MapState, field_of
 
 
 class BackgroundMapper:
-    """Updates a map in a thread; `field` is always the newest finished one.
+    """Updates a map in a background thread; `field` is always the newest finished map.
 
-    One frame waits while another is fused; a newer one takes its place, so that a slow machine
-    maps fewer frames instead of old ones. Use it in a `with` block, or call `close`.
+    One frame waits while another is fused. A newer frame replaces the waiting one, so that a slow
+    machine maps fewer frames and not older ones. Use it in a `with` block, or call `close`.
 
     Attributes:
-        field: What to plan on: the newest snapshot, with the stamp of its frame. Reading it never
-            waits.
-        dropped: Frames that gave way to newer ones.
-        rejected: Frames that `update` refused, the last reason in `rejection`.
-        rejection: The last such ValueError, or None.
+        field: The newest snapshot, with the stamp of its frame. Reading it never waits.
+        dropped: Number of frames that newer ones replaced.
+        rejected: Number of frames that `update` refused.
+        rejection: The last ValueError of `update`, or None.
+
+    Example:
+        >>> with hio.BackgroundMapper(state) as mapper:
+        ...     mapper.put(cloud, pose, stamp)
+        ...     command = controller(mapper.field, robot_state)
     """
 
     def __init__(self, state: MapState) -> None:
         """Starts the thread.
 
         Args:
-            state: The map so far, from `init`, `load` or another mapper; not to be donated
-                afterwards.
+            state: The map so far, from `init`, `load` or another mapper. Do not donate it later.
         """
         self.field: Field = field_of(state)
         self.dropped = 0
@@ -50,9 +52,9 @@ class BackgroundMapper:
         """Hands a frame over and returns at once.
 
         Args:
-            cloud: As for `update`; not to be changed by the caller afterwards.
+            cloud: As for `update`. Do not change the array afterwards.
             pose: As for `update`.
-            stamp: When the frame was taken, s on the caller's clock, counted from a start.
+            stamp: Time of the frame, s on the caller's clock, counted from the start of the run.
 
         Raises:
             RuntimeError: The mapper is closed, or its thread has failed.
@@ -66,10 +68,10 @@ class BackgroundMapper:
             self._changed.notify_all()
 
     def wait(self) -> MapState:
-        """Waits until every frame that was handed over is fused or dropped.
+        """Waits until every frame is fused or dropped.
 
         Returns:
-            The map. It shares memory with `field`: do not donate it while that is in use.
+            The map. It shares memory with `field`: do not donate it while `field` is in use.
 
         Raises:
             RuntimeError: The mapper's thread has failed.
@@ -82,7 +84,7 @@ class BackgroundMapper:
             return self._state
 
     def close(self) -> MapState:
-        """Fuses what waits, ends the thread and returns the map, as `wait`.
+        """Fuses the waiting frame, ends the thread and returns the map.
 
         Raises:
             RuntimeError: The mapper's thread has failed.
@@ -122,8 +124,8 @@ class BackgroundMapper:
 
     def _fuse(self, cloud: Any, pose: Any, stamp: float) -> None:
         try:
-            # Finished before it is shown: nobody is to wait for the device in its place. The old
-            # state is not donated, so that the old field stays valid without a copy.
+            # Finished before it is published, so that no reader waits for the device. The old state
+            # is not donated, so that the old field stays valid without a copy.
             state = jax.block_until_ready(update(self._state, cloud, pose))
         except ValueError as reason:
             self.rejected += 1

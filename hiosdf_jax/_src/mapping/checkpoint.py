@@ -1,4 +1,4 @@
-"""Saving a map to one file and loading it again: a resumed run goes on bit by bit."""
+"""Saves a map to one file and loads it; a resumed run continues bit by bit."""
 
 from __future__ import annotations
 
@@ -23,14 +23,24 @@ from hiosdf_jax._src.state import MapState
 _FORMAT = "hiosdf_jax map"
 _VERSION = 2
 
-# What numpy and zipfile raise for files that are damaged, or no archives.
+# Names in the file are part of its format; attributes of the code may be renamed.
+_FILE_NAMES = {
+    "grid.evidence.root_weight": "grid.weight",
+    "grid.evidence.mean": "grid.surface.mean",
+    "grid.evidence.axes": "grid.surface.axes",
+    "grid.evidence.": "grid.",
+    "grid.derived.": "grid.surface.",
+    "network.average.": "network.served.",
+}
+
+# Raised by numpy and zipfile for damaged files and for files that are no archives.
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, KeyError)
 
 
 def save(path: str | os.PathLike[str], state: MapState) -> None:
     """Writes the whole map to one compressed .npz file, without pickle.
 
-    The file is written aside and renamed, so that a crash leaves the old one as it was.
+    The file is written under a temporary name and renamed, so that a crash keeps the old file.
 
     Args:
         path: The file; its folder must exist.
@@ -39,6 +49,9 @@ def save(path: str | os.PathLike[str], state: MapState) -> None:
     Raises:
         ValueError: `state` is not a map.
         FileNotFoundError: There is no such folder.
+
+    Example:
+        >>> hio.save("house.npz", state)
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState")
@@ -75,9 +88,12 @@ def load(path: str | os.PathLike[str]) -> MapState:
         The map, as it was.
 
     Raises:
-        ValueError: The file is not a map, is damaged, or is of a newer version; the message names
-            the file and what is wrong with it.
+        ValueError: The file is not a map, is damaged, or has another version. The message names the
+            file and the problem.
         FileNotFoundError: There is no such file.
+
+    Example:
+        >>> state = hio.load("house.npz")
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -85,7 +101,7 @@ def load(path: str | os.PathLike[str]) -> MapState:
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
-        # Of other files numpy says that they might be pickles, and how to load those.
+        # numpy suggests to unpickle files of other kinds.
         reason = "it is none" if "pickle" in str(error) else error
         raise ValueError(f"{path} is not a readable .npz file: {reason}") from error
     try:
@@ -117,10 +133,18 @@ def load(path: str | os.PathLike[str]) -> MapState:
 
 
 def _without_key(state: MapState) -> MapState:
-    """The map with its typed key as plain numbers, which a file can hold."""
+    """Replaces the typed key by plain numbers, which a file can hold."""
     return state.replace(key=jax.random.key_data(state.key))
 
 
 def _named_leaves(tree: Any) -> dict[str, Any]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
+    return {_file_name(name): leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
+
+
+def _file_name(name: str) -> str:
+    for prefix, in_file in _FILE_NAMES.items():
+        if name.startswith(prefix):
+            return in_file + name.removeprefix(prefix)
+    return name

@@ -1,4 +1,4 @@
-"""Clouds and poses as a robot gives them: checked, and made to fit the compiled update."""
+"""Checks clouds and poses, and pads or draws clouds to the shape of the compiled update."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from hiosdf_jax._src.numerics.rigid import is_rigid
 
-_HASHED_EVERY = 64  # row of a cloud
+_HASHED_EVERY = 64  # rows of a cloud per hashed row
 
 
 def check_shapes(cloud: Any, pose: Any) -> None:
-    """Checks what is known of tracers as well.
+    """Checks shapes, of tracers as well.
 
     Args:
         cloud: (N, 3).
@@ -29,12 +29,13 @@ def check_shapes(cloud: Any, pose: Any) -> None:
 
 
 def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
-    """Checks the values of a cloud and its pose, and gives the cloud the shape of all others.
+    """Checks the values of a cloud and its pose, and brings the cloud to a fixed shape.
 
     Args:
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
         pose: (4, 4) T_world_sensor.
-        capacity: Rows to pad with NaN to, or to draw from the finite rows.
+        capacity: Rows of the result. Smaller clouds are padded with NaN; larger ones are drawn from
+            at random.
 
     Returns:
         The cloud (capacity, 3) and the pose, float32.
@@ -58,24 +59,24 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
     if count <= capacity:
         padded[:count] = cloud
     else:
-        # The draw must be a function of the arguments alone, and differ from cloud to cloud.
+        # The draw must be a function of the arguments, and differ from cloud to cloud.
         seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), zlib.crc32(pose.tobytes()))
         rows = _draw(finite, seed, capacity)
         count = len(rows)
-        np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" takes a copy more
+        np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" copies twice
     padded[count:] = np.nan
     return padded, pose
 
 
 def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:
-    """Indices of `capacity` of the rows that are finite, or of all if they are no more."""
+    """Draws the indices of at most `capacity` finite rows."""
     rows = np.flatnonzero(finite)
     dropped = len(rows) - capacity
     if dropped <= 0:
         return rows
     rng = np.random.default_rng(seed)
-    # With repetitions, until enough are different: of those to keep or of those to drop, whichever
-    # are fewer. A permutation would touch every row of a large cloud.
+    # Draws with repetition until enough rows are distinct: the rows to keep or those to drop,
+    # whichever are fewer. A permutation would touch every row of a large cloud.
     fewer = min(capacity, dropped)
     chosen = np.zeros(len(rows), bool)
     while missing := fewer - np.count_nonzero(chosen):

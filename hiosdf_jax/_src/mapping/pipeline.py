@@ -1,4 +1,4 @@
-"""The map's life: `init`, `update`, `snapshot`, `grow`. The one place where the stages meet."""
+"""Makes a map, updates it with clouds, copies it for planners, and enlarges it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.field.points import field_of
-from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches
-from hiosdf_jax._src.grid.change import change_by
-from hiosdf_jax._src.grid.rays import place_cloud
-from hiosdf_jax._src.mapping import calibration, intake
-from hiosdf_jax._src.network import training
+from hiosdf_jax._src.grid.evidence import empty_grid
+from hiosdf_jax._src.mapping import intake
+from hiosdf_jax._src.mapping.calibration import initial_optimism
+from hiosdf_jax._src.mapping.stages import begin, run_stages
+from hiosdf_jax._src.network.training import init_network
 from hiosdf_jax._src.numerics.rigid import is_rigid
-from hiosdf_jax._src.samples import from_grid
-from hiosdf_jax._src.samples.draw import concatenate
-from hiosdf_jax._src.samples.from_cloud import sample_local
-from hiosdf_jax._src.state import Field, Flag, MapState, Report
+from hiosdf_jax._src.state import Field, Flag, MapState, Report, field_of
 
 
 def init(config: Config, key: jax.Array) -> MapState:
@@ -35,21 +31,25 @@ def init(config: Config, key: jax.Array) -> MapState:
         The map; its distances are those of an untrained network.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: `config` is not a Config, or `key` is not one key.
+
+    Example:
+        >>> config = hio.Config.light(bounds=((0, 0, 0), (10, 8, 3)))
+        >>> state = hio.init(config, jax.random.key(0))
     """
     if not isinstance(config, Config):
         raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
     key = _typed_key(key)
     key, network_key = jax.random.split(key)
 
-    def zero() -> jax.Array:  # an array of its own each, so that the state can be donated
+    def zero() -> jax.Array:  # one array per leaf, so that the state can be donated
         return jnp.zeros((), jnp.int32)
 
     return MapState(
         config=config,
-        grid=evidence.empty_grid(config),
-        network=training.init_network(config, network_key),
-        optimism=calibration.initial(),
+        grid=empty_grid(config),
+        network=init_network(config, network_key),
+        optimism=initial_optimism(),
         key=key,
         updates=zero(),
         report=Report(
@@ -67,28 +67,30 @@ def init(config: Config, key: jax.Array) -> MapState:
 def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> MapState:
     """Fuses one posed point cloud into the map.
 
-    Pure: the given state stays valid, unless it is donated. Called with concrete arrays it checks
-    them, pads or draws the cloud to `config.max_points` rows and runs one compiled function; called
-    inside `jit`, `lax.scan` or `vmap` it takes the shapes as they are and reports by
-    `state.report.flags`. Under `vmap` what is computed in the smaller window of two is computed in
-    both.
+    Pure: the given state stays valid unless it is donated. Outside jit, the arguments are checked,
+    the cloud is padded or drawn to `config.max_points` rows, and one compiled function runs. Inside
+    `jit`, `lax.scan` or `vmap` the shapes are used as they are, and problems are reported by
+    `state.report.flags`. Under `vmap`, stages that choose between two windows compute both.
 
     Args:
         state: The map so far.
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
         pose: (4, 4) T_world_sensor, rigid.
-        donate: Give the memory of `state` to the new map, which is ready sooner then on a GPU, but
-            not on a CPU. Afterwards neither the old map can be used nor what shares arrays with it:
-            its `report`, or a `BackgroundMapper` that began with it. What `snapshot`, `bake` and
-            `grow` made of it stays valid. If this raises a ValueError, nothing has been donated.
-            Inside jit it has no effect: donate the arguments of that function instead.
+        donate: Reuse the memory of `state` for the new map. This is faster on a GPU, not on a CPU.
+            The old map, its `report` and a `BackgroundMapper` that began with it become invalid.
+            Results of `snapshot`, `bake` and `grow` stay valid. A ValueError donates nothing.
+            Inside jit this has no effect: donate the arguments of the outer function instead.
 
     Returns:
         The new map.
 
     Raises:
-        ValueError: A shape is wrong; outside jit also: the pose is not finite or not rigid, or
-            the cloud has no finite row.
+        ValueError: A shape is wrong. Outside jit also: the pose is not finite or not rigid, or the
+            cloud has no finite row.
+
+    Example:
+        >>> for cloud, pose in stream:
+        ...     state = hio.update(state, cloud, pose)
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
@@ -101,11 +103,12 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
-    """Copies what queries need, so that a planner can hold it while the map goes on.
+    """Copies what queries need, so that a planner can hold it while the map is updated.
 
     Args:
         state: The map.
-        stamp: When that is, s on the caller's clock; kept as float32, so count from a start.
+        stamp: Time of the snapshot, s on the caller's clock. It is stored as float32, so count from
+            the start of the run.
 
     Returns:
         A field that shares no memory with the map.
@@ -115,15 +118,15 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
-    """Enlarges the box of a map and keeps all that it knows.
+    """Enlarges the box of a map and keeps its content.
 
     Args:
-        state: The map; not inside jit, since the arrays change their shapes.
-        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; contains the old bounds.
+        state: The map. Not inside jit, since the arrays change their shapes.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; they contain the old bounds.
 
     Returns:
-        The map in the new box, which shares no memory with the old one. Inside the old box it
-        answers bit by bit as before.
+        The map in the new box. It shares no memory with the old map, and answers bit by bit as
+        before inside the old box.
 
     Raises:
         ValueError: The new bounds do not contain the old ones.
@@ -138,9 +141,9 @@ def grow(state: MapState, bounds: Any) -> MapState:
     start = np.subtract(old.corner_index, new.corner_index)
     place = tuple(slice(a, a + n) for a, n in zip(start, old.grid_shape, strict=True))
     grid = jax.tree.map(
-        lambda empty, known: empty.at[place].set(known), evidence.empty_grid(new), state.grid
+        lambda empty, known: empty.at[place].set(known), empty_grid(new), state.grid
     )
-    rest = jax.tree.map(jnp.copy, state.replace(grid=None))  # either map can be donated
+    rest = jax.tree.map(jnp.copy, state.replace(grid=None))  # so that either map can be donated
     return rest.replace(config=new, grid=grid)
 
 
@@ -160,86 +163,12 @@ def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
     return jax.lax.cond(usable, _integrate, lambda state, *_: state, state, cloud, finite, pose)
 
 
+def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> MapState:
+    return run_stages(begin(state, cloud, finite, pose)).state
+
+
 _update_jit = jax.jit(_update)
 _update_donating = jax.jit(_update, donate_argnums=0)
-
-
-def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> MapState:
-    config = state.config
-    key, grid_key, local_key, order_key, check_key = jax.random.split(state.key, 5)
-
-    beams = place_cloud(config, cloud, finite, pose)
-    sensor_world = beams.sensor_world
-
-    # How well the map so far foretold the newest cloud.
-    used = beams.ends & beams.inside
-    optimism = calibration.calibrate(
-        field_of(state), beams.points_world, used, sensor_world, check_key
-    )
-
-    # The coarse grid (paper, IV-B).
-    start, window = evidence.read_evidence(config, state.grid, sensor_world)
-    window = patches.fuse_hits(config, window, start, beams.points_world, beams.ends, sensor_world)
-    window = carving.trace_rays(config, window, start, beams)
-    window = evidence.fade_evidence(config, window)
-    grid = evidence.write_evidence(state.grid, start, window)
-    change = change_by(beams)
-    grid = distance.update_distances(config, grid, change)
-    grid = frontier.update_frontier(config, grid, change)
-
-    # What the network learns from (IV-B, IV-C), and its fit (IV-D).
-    samples = concatenate(
-        from_grid.sample_grid(config, grid, grid_key),
-        sample_local(config, beams.points_world, beams.ends, sensor_world, local_key),
-    )
-    extra_epochs, average = schedule(config, state.updates)
-    network, parts, trained = training.train(
-        config, state.network, samples, extra_epochs, average, order_key
-    )
-
-    outside = beams.ends & ~beams.inside
-    flags = (
-        state.report.flags
-        | jnp.where(jnp.any(outside), Flag.POINTS_OUTSIDE, 0).astype(jnp.uint32)
-        | jnp.where(trained, 0, Flag.TRAINING_FAILED).astype(jnp.uint32)
-    )
-
-    def count(rows: jax.Array) -> jax.Array:
-        return jnp.sum(rows, dtype=jnp.int32)
-
-    return state.replace(
-        grid=grid,
-        network=network,
-        optimism=optimism,
-        key=key,
-        updates=state.updates + 1,
-        report=Report(
-            points_used=count(used),
-            points_outside=count(outside),
-            points_out_of_range=count(finite & ~beams.ends),
-            points_invalid=count(~finite),
-            sdf_loss=parts.sdf,
-            eikonal_loss=parts.eikonal,
-            flags=flags,
-        ),
-    )
-
-
-def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How the network is trained at an update.
-
-    Args:
-        config: The map's configuration.
-        updates: () int32, that the map has had.
-
-    Returns:
-        extra_epochs: () int32, beyond those that every update makes.
-        average: () share of the old weights in those that are served; a running mean over the
-            first updates, so that the untrained network is never served.
-    """
-    epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
-    extra_epochs = epochs - training.least_epochs(config)
-    return extra_epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
 
 
 def _typed_key(key: Any) -> jax.Array:

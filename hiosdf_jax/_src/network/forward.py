@@ -1,10 +1,10 @@
-"""The SIREN's forward and backward pass, written out for speed.
+"""The SIREN's value and gradient, written out for speed.
 
-Autodiff of the plain network gives the same numbers. Here the sine and the cosine of a layer come
-from one range reduction, the input gradient shares the forward pass with the value, and on a GPU
-what lies between the layers is kept in float16, since a SIREN costs memory traffic. Its numbers
-suit float16 (sines, cosines times omega_0, phases of a few radians), which has eight times the
-precision of bfloat16 at the same speed; weights and all accumulation are float32.
+Autodiff of the plain network gives the same numbers. Here one range reduction gives the sine and
+the cosine of a layer, and the gradient shares the forward evaluation with the value. A SIREN is
+limited by memory traffic, so on a GPU activations are float16. Sines, cosines times omega_0 and
+phases of a few radians suit float16, which has eight times the precision of bfloat16 at the same
+speed. Weights and accumulation are float32.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Layer = tuple[jax.Array, jax.Array]  # kernel, bias
 
 
 def stored_dtype() -> Any:
-    """What activations are rounded to on the default device."""
+    """Returns the type of stored activations on the default device."""
     return jnp.float32 if jax.default_backend() == "cpu" else jnp.float16
 
 
 def layers_of(params: Any) -> list[Layer]:
-    """The layers of a `Siren`'s parameters, from input to output."""
+    """Lists the layers of a `Siren`'s parameters, from input to output."""
     dense = params["params"]
     return [(dense[f"Dense_{k}"]["kernel"], dense[f"Dense_{k}"]["bias"]) for k in range(len(dense))]
 
@@ -73,9 +73,9 @@ def value_and_gradient(
 def _forward(
     frequency: float, layers: list[Layer], points: jax.Array
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Sines of the last hidden layer, and each layer's cosines times omega_0."""
+    """Computes the sines of the last hidden layer and every layer's cosines times omega_0."""
     kernel, bias = layers[0]
-    # Metres need all of float32: written out, no unit rounds them.
+    # Meters need all of float32: written out, no tensor core rounds them.
     z = sum(points[..., k, None] * kernel[k] for k in range(3)) + bias
     sines, cosines = _activate(frequency, z)
     every = [cosines]
@@ -121,7 +121,7 @@ def _dot(x: jax.Array, kernel: jax.Array, dtype: Any) -> jax.Array:
 def _activation(frequency: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     sine, cosine = sine_and_cosine(frequency * z)
     result = sine.astype(stored_dtype()), (frequency * cosine).astype(stored_dtype())
-    # Once: for a CPU, XLA would compute them again in each of the kernels that read them.
+    # Computed once: on a CPU, XLA would repeat them in each kernel that reads them.
     on_cpu = jax.default_backend() == "cpu"
     return jax.lax.optimization_barrier(result) if on_cpu else result
 
@@ -141,5 +141,5 @@ _activation.defvjp(_activation_forward, _activation_backward)
 
 
 def _activate(frequency: float, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """sin(omega_0 z), and its derivative by z."""
+    """Computes sin(omega_0 z) and its derivative by z."""
     return _activation(jnp.float32(frequency), z)

@@ -20,8 +20,8 @@ class Siren(nn.Module):
     """A fully connected network with sine activations.
 
     Attributes:
-        width: Of the input layer and of each hidden layer.
-        layers: Hidden layers after the input layer.
+        width: Width of the input layer and of each hidden layer.
+        layers: Number of hidden layers after the input layer.
         frequency: omega_0.
     """
 
@@ -46,14 +46,14 @@ class Siren(nn.Module):
         return nn.Dense(width, kernel_init=uniform, bias_init=uniform)(x)
 
 
-def siren(config: Config) -> Siren:
-    """The network that a configuration describes."""
+def network_of(config: Config) -> Siren:
+    """Makes the network that a configuration describes."""
     return Siren(config.hidden_width, config.hidden_layers, config.frequency)
 
 
 def init_params(config: Config, key: jax.Array) -> Any:
-    """Draws the network's first weights from U(-sqrt(6 / n) / omega_0, sqrt(6 / n) / omega_0)."""
-    return siren(config).init(key, jnp.zeros((1, 3), jnp.float32))
+    """Draws initial weights from U(-sqrt(6 / n) / omega_0, sqrt(6 / n) / omega_0)."""
+    return network_of(config).init(key, jnp.zeros((1, 3), jnp.float32))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -75,7 +75,7 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
 def _predict_jvp(config: Config, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     (params, points), (by_params, by_points) = primals, tangents
     if not _all_zero(by_params):
-        return jax.jvp(siren(config).apply, primals, _instantiate(primals, tangents))
+        return jax.jvp(network_of(config).apply, primals, _instantiate(primals, tangents))
     value, gradient = predict_with_gradient(config, params, points)
     return value, jnp.sum(gradient * _instantiate(points, by_points), axis=-1)
 
@@ -102,7 +102,9 @@ def predict_with_gradient(
 @predict_with_gradient.defjvp
 def _predict_with_gradient_jvp(config: Config, primals: Any, tangents: Any) -> Any:
     def plain(params: Any, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return value_and_gradient(lambda x: jnp.asarray(siren(config).apply(params, x)), points)
+        return value_and_gradient(
+            lambda x: jnp.asarray(network_of(config).apply(params, x)), points
+        )
 
     return jax.jvp(plain, primals, tangents)
 

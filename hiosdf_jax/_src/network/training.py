@@ -1,4 +1,4 @@
-"""The fit of the network to samples (paper, section IV-D)."""
+"""Fits the network to samples (paper, section IV-D)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Losses(NamedTuple):
 
 
 def init_network(config: Config, key: jax.Array) -> Network:
-    """Makes an untrained network whose zero is the middle of the bounds.
+    """Makes an untrained network with its origin in the middle of the bounds.
 
     Args:
         config: The map's configuration.
@@ -41,14 +41,14 @@ def init_network(config: Config, key: jax.Array) -> Network:
     params = siren.init_params(config, key)
     return Network(
         params=params,
-        served=jax.tree.map(jnp.copy, params),
+        average=jax.tree.map(jnp.copy, params),
         optimizer=_optimizer(config).init(params),
         origin_world=jnp.mean(jnp.asarray(config.bounds, jnp.float32), axis=0),
     )
 
 
 def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """Computes the losses over samples, the Eikonal one over the first of them.
+    """Computes the losses over samples; the Eikonal loss takes the first group of them.
 
     Args:
         config: The map's configuration.
@@ -63,8 +63,25 @@ def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> 
 
 
 def least_epochs(config: Config) -> int:
-    """Epochs that every update makes, be it one of the warm-up or not."""
+    """Returns the number of epochs that every update makes, during warm-up or not."""
     return min(config.epochs, config.warmup_epochs)
+
+
+def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Computes how an update trains the network.
+
+    Args:
+        config: The map's configuration.
+        updates: Number of earlier updates, () int32.
+
+    Returns:
+        extra_epochs: Epochs beyond `least_epochs`, () int32.
+        average: Share of the old weights in the average, (). Over the first updates it is a running
+            mean, so that queries never use the untrained network.
+    """
+    epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
+    extra_epochs = epochs - least_epochs(config)
+    return extra_epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
 
 
 def train(
@@ -75,19 +92,20 @@ def train(
     average: jax.Array,
     key: jax.Array,
 ) -> tuple[Network, Losses, jax.Array]:
-    """Continues training, and averages the weights that are served.
+    """Continues training, and updates the average weights.
 
     Args:
         config: The map's configuration.
         network: The network so far.
-        samples: What to fit.
-        extra_epochs: () int32 times to go through the samples beyond `least_epochs`.
-        average: () share of the old weights in those that are served.
+        samples: The samples to fit.
+        extra_epochs: Epochs beyond `least_epochs`, () int32.
+        average: Share of the old weights in the average, ().
         key: Source of randomness, for the order of the samples.
 
     Returns:
-        The network, the mean losses of the last epoch, and whether all is finite; if not, the
-        network is as it was.
+        network: The trained network; unchanged if training was not finite.
+        parts: The mean losses of the last epoch.
+        finite: Whether losses and weights are finite, () bool.
     """
     optimizer = _optimizer(config)
     batches = _split(config, samples, key)
@@ -97,7 +115,7 @@ def train(
         sums = _sums(config, params, points, tile)
         parts = _means(sums, weights)
         loss = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
-        # A sum instead of a mean: single samples' shares of it would vanish in float16.
+        # A sum and not a mean: a single sample's share of the mean would vanish in float16.
         return loss * _count(weights), sums
 
     def step(carry: tuple[Any, Any], batch: Samples) -> tuple[tuple[Any, Any], Losses]:
@@ -123,8 +141,8 @@ def train(
     if jax.default_backend() == "cpu":
         params, state, parts = jax.lax.fori_loop(0, least + extra_epochs, epoch, start)
     else:
-        # A GPU waits for the host at each turn of a loop whose length is not known before, and
-        # `update` returns only after the last such turn.
+        # A GPU waits for the host at each iteration of a loop of unknown length, and `update`
+        # returns only after the last one.
         extra = jax.lax.fori_loop(0, extra_epochs, epoch, start)
         params, state, parts = jax.lax.fori_loop(
             0, least, lambda number, carry: epoch(extra_epochs + number, carry), extra
@@ -133,21 +151,21 @@ def train(
     finite = jnp.isfinite(parts.sdf + parts.eikonal) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(params)])
     )
-    served = jax.tree.map(
-        lambda old, new: average * old + (1 - average) * new, network.served, params
+    mean = jax.tree.map(
+        lambda old, new: average * old + (1 - average) * new, network.average, params
     )
     points = samples.points_world - network.origin_world
-    residual = siren.predict(config, served, points) - samples.sdf
-    served = siren.shift_output(config, served, -_median(residual, samples.weight))
-    trained = network.replace(params=params, served=served, optimizer=state)
+    residual = siren.predict(config, mean, points) - samples.sdf
+    mean = siren.shift_output(config, mean, -_median(residual, samples.weight))
+    trained = network.replace(params=params, average=mean, optimizer=state)
     kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), trained, network)
     return kept, parts, finite
 
 
 def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
-    """Deals samples to (batches, tiles, size) parts; what does not fill a batch is left out.
+    """Distributes samples to (batches, tiles, size); those that do not fill a batch are left out.
 
-    The `eikonal_every` groups of a tile, those whose slopes count in turn, lie one after another.
+    The slopes of the `eikonal_every` groups of a tile count in turn. The groups are contiguous.
     """
     count = samples.sdf.shape[0]
     size = count // config.batches
@@ -160,38 +178,37 @@ def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
 
 
 def _order(config: Config, count: int, key: jax.Array) -> jax.Array:
-    """Shuffles what goes to several batches, or groups."""
+    """Shuffles samples for several batches or groups."""
     if config.batches > 1:
         return jax.random.permutation(key, count)
     if config.eikonal_every > 1:
-        # The samples themselves are drawn anew at every update: the same order will do. It must
-        # only not be their own, in which each n-th sample of a ray is at the same of its depths.
+        # The samples are drawn anew at every update, so one order suffices. Their own order would
+        # not do: there each n-th sample of a ray is at the same depth.
         return jnp.asarray(np.random.default_rng(0).permutation(count))
     return jnp.arange(count)
 
 
 def _turn(config: Config, batches: Samples, epoch: jax.Array) -> Samples:
-    """Moves each tile on to its next group in every epoch: the slopes of the first one count.
+    """Rotates the groups of each tile by one per epoch; the slopes of the first group count.
 
-    Were it the same group in all epochs of an update, the network would fit its slopes alone.
+    With the same group in all epochs of an update, the network would fit its slopes alone.
     """
     if config.eikonal_every == 1:
         return batches
     size, sloped = batches.weight.shape[2], _sloped(config, batches)
-    turns = size // math.gcd(size, sloped)  # after so many all is where it was
+    turns = size // math.gcd(size, sloped)  # the rotation has this period
     places = -(epoch % turns) * sloped
     return jax.tree.map(lambda array: jnp.roll(array, places, axis=2), batches)
 
 
 def _sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """The losses times what `_weights` returns."""
+    """Computes the losses times the sums of `_weights`."""
     sloped = _sloped(config, samples)
     value, gradient = forward.value_and_gradient(config.frequency, params, points[:sloped])
     if sloped < points.shape[0]:
         others = forward.value(config.frequency, params, points[sloped:])
         value = jnp.concatenate([value, others])
-    # Not a safe norm: where the gradient is 0 its direction is undefined anyway, and 1e-12 is
-    # enough to keep the derivative finite.
+    # Where the gradient is 0 its direction is undefined; 1e-12 keeps the derivative finite.
     slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + 1e-12)
     return Losses(
         jnp.sum(jnp.abs(value - samples.sdf) * samples.weight),
@@ -200,7 +217,7 @@ def _sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> L
 
 
 def _weights(config: Config, samples: Samples) -> Losses:
-    """Sums of the weights of all (..., N) samples, and of those whose slope counts."""
+    """Sums the weights of all (..., N) samples, and of those whose slope counts."""
     sloped = samples.weight[..., : _sloped(config, samples)]
     return Losses(jnp.sum(samples.weight), jnp.sum(sloped))
 
@@ -218,7 +235,7 @@ def _count(weights: Losses) -> jax.Array:
 
 
 def _median(values: jax.Array, weight: jax.Array) -> jax.Array:
-    """Median of the values with weight; 0 if there are none."""
+    """Computes the median of the values with weight; 0 if there are none."""
     median = jnp.nanmedian(jnp.where(weight > 0, values, jnp.nan))
     return jnp.where(jnp.any(weight > 0), median, 0)
 

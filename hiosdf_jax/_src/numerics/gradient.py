@@ -11,10 +11,10 @@ import jax.numpy as jnp
 def value_and_gradient(
     function: Callable[[jax.Array], jax.Array], points: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Evaluates a function and its gradient by one backward pass for the whole batch.
+    """Evaluates a function and its gradient with one vector-Jacobian product for the whole batch.
 
     Args:
-        function: Maps (..., n) to (...), each value by its own row alone.
+        function: Maps (..., n) to (...); each value depends on its own row only.
         points: (..., n).
 
     Returns:
@@ -25,16 +25,16 @@ def value_and_gradient(
 
 
 def least(values: jax.Array) -> jax.Array:
-    """Minimum along the last axis, with a derivative that holds however it is compiled.
+    """Computes the minimum along the last axis, with a derivative that is safe to compile.
 
-    That of `jnp.min` asks which of the values equal the least. A compiler may compute the values
-    again for that, rounded in another way; then none is equal, and the derivative is 0.
+    The derivative of `jnp.min` compares the values with the minimum. XLA may recompute the values
+    with other rounding. Then none is equal, and the derivative is 0.
 
     Args:
         values: (..., N), N > 0.
 
     Returns:
-        (...). Of several that are equal, the derivative is the first's.
+        (...); the derivative of the first of several equal values.
     """
     chosen = jnp.arange(values.shape[-1]) == jnp.argmin(values, axis=-1)[..., None]
     return jnp.sum(jnp.where(chosen, values, 0), axis=-1)

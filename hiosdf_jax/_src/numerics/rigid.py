@@ -1,4 +1,4 @@
-"""What makes a pose usable: finite, and rigid to the digits that it was written with."""
+"""The check that a pose is rigid."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import Any
 
 import jax.numpy as jnp
 
-# How far R^T R may be from the identity: real trajectories are written with few digits.
+# Largest deviation of R^T R from the identity; real trajectories have few digits.
 _TOLERANCE = 5e-3
 
 
 def is_rigid(pose: Any, np: Any = jnp) -> Any:
-    """Tells a rotation and a translation from any other matrix.
+    """Returns whether a matrix is a rotation and a translation.
 
     Args:
         pose: (4, 4).
-        np: The library to compute with; numpy outside jit costs no dispatches to a device.
+        np: jax.numpy, or numpy to avoid dispatches to a device outside jit.
 
     Returns:
         () bool; False for a pose that is not finite.

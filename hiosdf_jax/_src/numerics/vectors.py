@@ -1,7 +1,7 @@
-"""Vectors as three arrays, one a component.
+"""Vectors as three arrays, one per component.
 
-Where each of many points has vectors of its own, a last axis of three keeps XLA from using a CPU's
-vector instructions: the nearest patches of 102,400 points take three times as long with it.
+A last axis of three keeps XLA from using a CPU's vector instructions where each of many points has
+vectors of its own. The nearest patches of 102,400 points then take three times as long.
 """
 
 from __future__ import annotations
@@ -16,48 +16,48 @@ Vector = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def split(vectors: jax.Array) -> Vector:
-    """Takes (..., 3) vectors apart."""
+    """Splits (..., 3) vectors into components."""
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
 
 def join(vector: Vector) -> jax.Array:
-    """Puts vectors together, (..., 3)."""
+    """Joins components to (..., 3) vectors."""
     return jnp.stack(vector, axis=-1)
 
 
 def each(function: Callable[..., jax.Array], *vectors: Any) -> Vector:
-    """Applies a function to the components of vectors, one after another."""
+    """Applies a function to the components of vectors, one component at a time."""
     x, y, z = map(function, *vectors)
     return x, y, z
 
 
 def take(table: jax.Array, rows: jax.Array, first: int = 0) -> Vector:
-    """Gathers vectors from the rows of a table (N, M), from its column `first` on.
+    """Gathers vectors from the rows of a table (N, M), from column `first` on.
 
     Args:
-        table: Stored numbers, fewer than 2^31; floats become float32, integers int32.
-        rows: (...) which of its rows.
-        first: The column of the first component.
+        table: Fewer than 2^31 numbers; floats become float32, integers int32.
+        rows: Row indices, (...).
+        first: Column of the first component.
 
     Returns:
-        (...) each.
+        The components, (...) each.
     """
     floats = jnp.issubdtype(table.dtype, jnp.floating)
     dtype = jnp.float32 if floats else jnp.int32
-    # One index a number: a pair of them takes twice as long on a CPU. Unsigned, so that
-    # none is looked at for being negative.
+    # One index per number: a pair takes twice as long on a CPU. Unsigned: no check for negative
+    # indices.
     flat, start = table.ravel(), rows.astype(jnp.uint32) * table.shape[1] + first
     x, y, z = (flat[start + k].astype(dtype) for k in range(3))
     return x, y, z
 
 
 def dot(first: Vector, second: Vector) -> jax.Array:
-    """Scalar product."""
+    """Computes scalar products."""
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def length(vector: Vector) -> jax.Array:
-    """Length, with gradient 0 instead of NaN at 0."""
+    """Computes lengths, with gradient 0 instead of NaN at 0."""
     square = dot(vector, vector)
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)

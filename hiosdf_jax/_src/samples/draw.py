@@ -1,4 +1,4 @@
-"""What the network is trained on: points with signed distances."""
+"""Training samples: points with signed distances, and uniform draws from a mask."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Samples(NamedTuple):
 
     Attributes:
         points_world: (N, 3) m.
-        sdf: (N,) m.
-        weight: (N,) 0 or 1; samples of weight 0 are padding.
+        sdf: Signed distances, (N,) m.
+        weight: 0 or 1, (N,); samples of weight 0 are padding.
     """
 
     points_world: jax.Array
@@ -25,24 +25,24 @@ class Samples(NamedTuple):
 
 
 def concatenate(*parts: Samples) -> Samples:
-    """Joins sets of samples."""
+    """Concatenates sets of samples."""
     return Samples(*(jnp.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def draw_from_mask(mask: jax.Array, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draws elements of a mask uniformly, with replacement.
+    """Draws True elements of a mask uniformly, with replacement.
 
-    What is drawn depends on the order of the True elements alone: False ones in between or at the
-    end, the padding of a cloud, change nothing.
+    The draw depends only on the order of the True elements. False elements, such as the padding of
+    a cloud, change nothing.
 
     Args:
         mask: (...) bool.
-        count: How many to draw.
+        count: Number of elements to draw.
         key: Source of randomness.
 
     Returns:
-        index: (count,) int32 into the raveled mask.
-        possible: () bool, whether any element is True; if not, the indices mean nothing.
+        index: Indices into the raveled mask, (count,) int32.
+        possible: Whether any element is True, () bool; the indices are undefined otherwise.
     """
     words = _words(mask.ravel())
     rank = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
@@ -56,13 +56,13 @@ def draw_from_mask(mask: jax.Array, count: int, key: jax.Array) -> tuple[jax.Arr
 
 
 def _words(mask: jax.Array) -> jax.Array:
-    """Packs (N,) bool into words, the first one in the lowest bit: sums over them are shorter."""
+    """Packs (N,) bool into words, lowest bit first, so that sums are over fewer elements."""
     bits = jnp.pad(mask, (0, -mask.size % _WORD)).reshape(-1, _WORD).astype(jnp.uint32)
     return jnp.sum(bits << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
 
 
 def _nth_bit(words: jax.Array, n: jax.Array) -> jax.Array:
-    """Position of the n-th (from 0) bit that is set in each word, by halves."""
+    """Finds the position of the n-th set bit of each word (n from 0) by bisection."""
     position = jnp.zeros_like(n)
     for half in (16, 8, 4, 2, 1):
         low = words & jnp.uint32((1 << half) - 1)

@@ -1,0 +1,50 @@
+"""Shifted copies of an array along an axis, for separable distance transforms."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Padded(NamedTuple):
+    """An array with a margin at both ends of one axis.
+
+    Attributes:
+        values: The array with its margins.
+        axis: The padded axis.
+        reach: Width of each margin, the largest possible shift.
+    """
+
+    values: jax.Array
+    axis: int
+    reach: int
+
+    def shifted(self, shift: int) -> jax.Array:
+        """Returns the array whose element i is element i + shift, without the margins."""
+        size = self.values.shape[self.axis] - 2 * self.reach
+        first = self.reach + shift
+        return jax.lax.slice_in_dim(self.values, first, first + size, axis=self.axis)
+
+    def part(self, first: jax.Array | int, size: int) -> Padded:
+        """Cuts the array down to `size` elements from `first` on, which need not be static."""
+        values = jax.lax.dynamic_slice_in_dim(self.values, first, size + 2 * self.reach, self.axis)
+        return self._replace(values=values)
+
+
+def pad_axis(array: jax.Array, axis: int, reach: int, fill: float = 0) -> Padded:
+    """Pads an array along an axis.
+
+    Args:
+        array: Any shape.
+        axis: The axis.
+        reach: Elements to add at each end.
+        fill: Their value.
+
+    Returns:
+        The padded array.
+    """
+    margin = [(0, 0)] * array.ndim
+    margin[axis] = (reach, reach)
+    return Padded(jnp.pad(array, margin, constant_values=fill), axis, reach)
