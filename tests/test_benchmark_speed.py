@@ -1,10 +1,11 @@
-"""The speed benchmark on tiny sizes: every row has numbers, and its parts are what they say."""
+"""The speed benchmark on tiny sizes, and its counts, tables and baselines by hand."""
 
 import dataclasses
 import functools
 import json
 import math
 import os
+import re
 import types
 
 import jax
@@ -15,11 +16,21 @@ from room import BOUNDS, CONFIG, room_cloud
 
 import hiosdf_jax as hio
 from benchmarks.speed import __main__ as command
-from benchmarks.speed import baselines, limits, rows, stages, tasks
+from benchmarks.speed import (
+    baselines,
+    limits,
+    plan,
+    processes,
+    queries,
+    rows,
+    scaling,
+    setup,
+    stages,
+    updates,
+)
 from hiosdf_jax import datasets
-from hiosdf_jax._src.grid import carving, distance, evidence, frontier
-from hiosdf_jax._src.grid.change import Window
-from hiosdf_jax._src.grid.rays import place_cloud
+from hiosdf_jax._src.grid import distance
+from hiosdf_jax._src.grid.windows import Window
 from hiosdf_jax._src.network import forward, siren, training
 from hiosdf_jax._src.samples.draw import Samples
 
@@ -30,7 +41,7 @@ TINY_CONFIG = {
     if field.name != "bounds"
 }
 TINY = dataclasses.replace(
-    tasks.QUICK,
+    setup.QUICK,
     overrides=TINY_CONFIG,
     paper_overrides={"near_samples": 60, "far_samples": 30, "local_points": 1, "epochs": 2},
     frames=3,
@@ -67,50 +78,59 @@ def stream(tmp_path):
     return path
 
 
+def setup_of(path, frames):
+    extent = datasets.Extent(BOUNDS, CONFIG.max_range)
+    return setup.Setup(TINY, path, frames, extent, deadline=math.inf)
+
+
 def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
     taken_apart = []
 
-    def take_apart(state, cloud, pose):
-        taken_apart.append((state, cloud, pose, stages.take_apart(state, cloud, pose)))
+    def take_apart(state, frame):
+        taken_apart.append((state, frame, stages.take_apart(state, frame)))
         return taken_apart[-1][-1]
 
-    def plan(bench):
-        return [(name, task) for name, task in tasks.plan(bench) if "sizes" not in name]
+    def chosen(setup):  # the others compile updates of their own, and have a test without
+        tasks = plan.plan(setup).items()
+        return {name: task for name, task in tasks if not re.search("sizes|donated", name)}
 
     def import_time(command, **_):
         return "1.5" if "hiosdf_jax" in command[-1] else "1.0"
 
     extent = datasets.Extent(BOUNDS, CONFIG.max_range)
     monkeypatch.setattr(command, "QUICK", TINY)
-    monkeypatch.setattr(command, "plan", plan)
-    monkeypatch.setattr(tasks.datasets, "find_bounds", lambda _: extent)
-    monkeypatch.setattr(tasks.subprocess, "check_output", import_time)
-    monkeypatch.setattr(tasks, "_HIOSDF", CHECKS_ITS_ARGUMENTS)
-    monkeypatch.setattr(tasks, "stages", types.SimpleNamespace(take_apart=take_apart))
+    monkeypatch.setattr(command, "plan", chosen)
+    monkeypatch.setattr(setup.datasets, "find_bounds", lambda _: extent)
+    monkeypatch.setattr(processes.subprocess, "check_output", import_time)
+    monkeypatch.setattr(processes, "_HIOSDF", CHECKS_ITS_ARGUMENTS)
+    parted = types.SimpleNamespace(take_apart=take_apart, time_parts=stages.time_parts)
+    monkeypatch.setattr(plan, "stages", parted)
     output = tmp_path / "out" / "speed.json"
     assert command.main(["--quick", "--stream", str(stream), "--output", str(output)]) == 0
     table = capsys.readouterr().out
     record = json.loads(output.read_text())
+    assert {"device", "jax", "revision", "host", "sizes"} <= record.keys()
     found = {row["name"]: row for row in record["rows"]}
     for name, row in found.items():
         assert name in table
-        if row["spread"] is None:
+        if "median" not in row:
             assert row["note"] == "this device does not report it"
             continue
-        spread = [row["spread"][key] for key in ("p10", "median", "p90", "p99")]
+        spread = [row.get(key, row["median"]) for key in ("p10", "median", "p90", "p99")]
         assert np.isfinite(spread).all() and spread == sorted(spread), row
         assert spread[0] > 0 or name.startswith("compilation"), row
-        assert not row["limit"] or row["share"] > 0, row
-    assert found["compilations during these"]["spread"]["median"] == 0
-    assert found["resident memory, peak of hiosdf map"]["spread"]["median"] > 5
+        assert "limit" not in row or row["share"] > 0, row
+    assert found["compilations during these"]["median"] == 0
+    assert found["resident memory, peak of hiosdf map"]["median"] > 5
     note = found["6 updates in a row, light, all"]["note"]
     assert note.startswith("flags: none; medians of its tenths: ") and note.count(",") == 5
-    for name in taken_apart[0][-1]:
-        assert found[f"{name}, light"]["limit"]
-    for key in {row["compare"] for row in record["rows"]} - {""}:
+    limited = ("update_distances, light", "train, light", "the paper's training, 2 epochs of 110")
+    for name in (*limited, "sdf and gradient of 300, network, light"):
+        assert found[name]["limit"]
+    for key in {row["compare"] for row in record["rows"] if "compare" in row}:
         for baseline in record["baselines"][key]:
-            assert baseline["spread"] or "torch" in baseline["reason"], baseline
-    measured = {key for key, beside in record["baselines"].items() if beside[0]["spread"]}
+            assert "median" in baseline or "torch" in baseline["reason"], baseline
+    measured = {key for key, beside in record["baselines"].items() if "median" in beside[0]}
     assert measured >= {
         "import",
         "nearest",
@@ -119,38 +139,31 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         "endurance",
         "live arrays before",
     }
+    ((state, frame, parts),) = taken_apart
+    assert {f"{name}, light" for name in parts} <= found.keys()
+    made, whole = parts["summarize"].after.state, hio.update(state, *frame)
+    pairs = zip(*map(jax.tree.leaves, map(without_key, (made, whole, state))), strict=True)
+    for ours, theirs, before in pairs:
+        np.testing.assert_allclose(
+            np.asarray(ours, float), np.asarray(theirs, float), rtol=1e-3, atol=1e-3
+        )
+        assert np.shape(before) == np.shape(ours)
+    assert int(whole.updates) == int(state.updates) + 1
+    assert np.abs(np.asarray(whole.grid.derived.sdf - state.grid.derived.sdf)).max() > 0.01
 
-    assert found["update, light, donated"]["compare"] == "not donated"
-    ((state, cloud, pose, parts),) = taken_apart
-    assert_stages_make_the_update(parts, state, hio.update(state, cloud, pose))
 
-
-def assert_stages_make_the_update(parts, state, whole):
-    network, _, _ = parts["training"].result
-    for ours, theirs, before in (
-        (parts["frontier"].result, whole.grid, state.grid),
-        (parts["calibration"].result, whole.optimism, None),
-        (network, whole.network, state.network),
-    ):
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-            np.testing.assert_allclose(
-                np.asarray(a, float), np.asarray(b, float), rtol=1e-3, atol=1e-3
-            )
-        if before is not None:
-            pairs = zip(jax.tree.leaves(theirs), jax.tree.leaves(before), strict=True)
-            assert max(np.abs(np.asarray(a, float) - np.asarray(b)).max() for a, b in pairs) > 0.01
+def without_key(state):
+    return state.replace(key=jax.random.key_data(state.key))
 
 
 def test_a_run_that_fails_has_no_peak(monkeypatch, tmp_path):
-    extent = datasets.Extent(BOUNDS, CONFIG.max_range)
-    bench = tasks.Bench(TINY, tmp_path, [], extent, deadline=math.inf)
-    monkeypatch.setattr(tasks, "_HIOSDF", "raise SystemExit(3)")
+    monkeypatch.setattr(processes, "_HIOSDF", "raise SystemExit(3)")
     with pytest.raises(RuntimeError, match="exit code 3"):
-        tasks.whole_run_rows(bench)
+        processes.run_command(tmp_path)
 
 
 def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
-    """With an update that does nothing: what it is given is what the rows are about."""
+    """An update that does nothing records its arguments, which the rows are about."""
     given = []
 
     def update(state, cloud, pose, donate=False):
@@ -160,19 +173,19 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
     def compilations():
         return {(config.grid_shape, config.max_points, donate) for config, _, donate in given}
 
-    monkeypatch.setattr(tasks.hio, "update", update)
-    extent = datasets.Extent(BOUNDS, CONFIG.max_range)
-    bench = tasks.Bench(TINY, tmp_path, [room_cloud(0)], extent, deadline=math.inf)
-    assert tasks.compile_sizes(bench) == []
+    monkeypatch.setattr(hio, "update", update)
+    tiny = setup_of(tmp_path, [room_cloud(0)])
+    assert scaling.compile_updates(tiny, "light").rows == []
     compiled = compilations()
     given.clear()
-    (row,) = tasks.donated_rows(bench)
+    (row,), beside = updates.donated_updates(tiny, "light")
     assert row.name == "update, light, donated" and row.spread.count == TINY.frames
-    assert bench.baselines["not donated"][0].spread.count == TINY.frames
+    assert row.compare == "not donated"
+    assert beside["not donated"][0].spread.count == TINY.frames
     assert sum(donate for *_, donate in given) == len(given) / 2
     whole = {one for one in compilations() if one[-1]}
     given.clear()
-    found = tasks.cloud_size_rows(bench)
+    found, beside = scaling.cloud_sizes(tiny)
     assert [row.name for row in found] == [
         "update, light, 200 points, 300 used",
         "update, light, 200 points, all used",
@@ -186,24 +199,51 @@ def test_sizes_of_clouds_and_maps(monkeypatch, tmp_path):
         (500, 500),
     }
     assert [row.compare for row in found] == ["", *["cloud size"] * 3]
-    (baseline,) = bench.baselines["cloud size"]
+    (baseline,) = beside["cloud size"]
     assert baseline == rows.Baseline("200 points, 300 used", found[0].spread)
     whole |= compilations()
     given.clear()
-    found = tasks.map_size_rows(bench)
+    found, beside = scaling.map_sizes(tiny)
     assert [row.note for row in found] == ["20x20x16 voxels", "40x40x16 voxels"]
     assert [row.compare for row in found] == ["", "map size"]
-    assert bench.baselines["map size"][0].spread == found[0].spread
+    assert beside["map size"][0].spread == found[0].spread
     assert {config.grid_shape for config, *_ in given} == {(20, 20, 16), (40, 40, 16)}
     assert compiled == whole | compilations()
 
 
-def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):
-    def plan(bench):
-        yield "broken", lambda: [][0]
-        yield "sound", lambda: [rows.Row("sound", "ms", rows.single(1.5))]
+def test_a_task_makes_what_it_needs_and_shares_it(monkeypatch, tmp_path):
+    """Tasks run in any order: maps and rates are made by the first that needs them."""
+    made = []
 
-    monkeypatch.setattr(command, "plan", plan)
+    def map_frames(setup, config, count):
+        made.append(config)
+        return updates.Mapped(hio.init(config, jax.random.key(0)), [1.0], 0.0)
+
+    def measure(*_):
+        made.append("rates")
+        return limits.Limits(1.0, 1.0, 1.0), rows.Measured([])
+
+    def asked(label, state, machine, sizes):
+        return rows.Measured([rows.Row(label, "ms", rows.single(machine.matrix))])
+
+    monkeypatch.setattr(updates, "map_frames", map_frames)
+    monkeypatch.setattr(limits, "measure", measure)
+    monkeypatch.setattr(queries, "ask_map", asked)
+    tasks = plan.plan(setup_of(tmp_path, []))
+    assert made == []
+    for _ in range(2):
+        (row,), _ = tasks["queries"]()
+        assert row.name == "light" and row.spread.median == 1.0
+    assert tasks["limits"]().rows == []
+    assert made == [CONFIG, "rates"]
+
+
+def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):
+    def two_tasks(setup):
+        sound = rows.Measured([rows.Row("sound", "ms", rows.single(1.5))])
+        return {"broken": lambda: [][0], "sound": lambda: sound}
+
+    monkeypatch.setattr(command, "plan", two_tasks)
     arguments = ["--stream", str(stream), "--output", str(tmp_path / "speed.json")]
     assert command.main(arguments) == 1
     table = capsys.readouterr().out
@@ -213,7 +253,7 @@ def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkey
     assert "not run" in capsys.readouterr().out
     assert command.main([*arguments, "--only", "oun", "nothing"]) == 0
     record = json.loads((tmp_path / "speed.json").read_text("utf-8"))
-    assert [row["name"] for row in record["rows"]] == ["sound"]
+    assert record["rows"] == [{"name": "sound", "unit": "ms", "median": 1.5}]
     assert record["took_s"] > 0
     assert record["host"].endswith(f"{os.cpu_count()} cores")
     with pytest.raises(SystemExit):
@@ -221,11 +261,34 @@ def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkey
     assert "'broken', 'sound'" in capsys.readouterr().err
 
 
+def test_a_record_has_a_row_s_numbers_and_nothing_that_it_lacks():
+    spread = rows.Spread(1.23456789, 1.0, 2.0, 3.0, 300)
+    row = rows.Row("ours", "ms", spread, "twice", "memory", 0.5)
+    assert rows.to_record(row) == {
+        "name": "ours",
+        "unit": "ms",
+        "median": 1.23457,
+        "p10": 1.0,
+        "p90": 2.0,
+        "p99": 3.0,
+        "count": 300,
+        "compare": "twice",
+        "limit": "memory",
+        "share": 0.5,
+    }
+    failed = rows.Row("theirs", note="no gone", failed=True)
+    assert rows.to_record(failed) == {"name": "theirs", "note": "no gone", "failed": True}
+    zero = rows.Row("compilations", spread=rows.single(0.0))
+    assert rows.to_record(zero) == {"name": "compilations", "median": 0.0}
+    none = rows.Baseline("gone", None, "no gone")
+    assert rows.to_record(none) == {"name": "gone", "reason": "no gone"}
+
+
 def test_work_is_what_xla_counts():
     config = hio.Config.paper(BOUNDS, eikonal_every=2, epochs=1, near_samples=400, far_samples=100)
     config = dataclasses.replace(config, local_points=10, local_ray_samples=10)
     network = training.init_network(config, jax.random.key(0))
-    points = jax.random.uniform(jax.random.key(1), (600, 3))  # not equal ones: XLA would share
+    points = jax.random.uniform(jax.random.key(1), (600, 3))  # XLA would share equal ones
     samples = Samples(points, points[:, 0], jnp.ones(600))
 
     def operations(function, *arguments):
@@ -259,74 +322,9 @@ def test_the_distance_transform_s_work_is_what_xla_is_given():
         config = hio.Config.light(((0, 0, 0), (2, 4, 3)), distance_horizon=horizon / 10)
         return limits.distance_work(config, window).vector
 
-    # The difference: what is done once, however far a pass looks, is not counted.
+    # The difference: the work that does not depend on the horizon is not counted.
     assert work(12) - work(6) == pytest.approx(2 * (counted(12) - counted(6)), rel=0.02)
     assert work(12) == pytest.approx(2 * work(6))
-
-
-def test_the_frontier_s_work_is_what_xla_is_given():
-    window = Window((5, 0, 0), (30, 30, 10), (8, 2, 0), (20, 24, 10))
-    seen = jnp.zeros(window.shape, bool)
-
-    def counted(reach):
-        search = functools.partial(frontier.signed_box_distance, reach=reach)
-        return jax.jit(search).lower(seen).cost_analysis()["flops"]
-
-    def work(reach):
-        config = hio.Config.light(((0, 0, 0), (4, 4, 1)), frontier_horizon=reach / 10)
-        assert config.frontier_voxels == reach
-        return limits.frontier_work(config, window).vector
-
-    # Beyond 9 voxels the shortest axis has no more to compare.
-    assert work(12) - work(6) == pytest.approx(counted(12) - counted(6), rel=0.05)
-    assert work(6) == pytest.approx(counted(6), rel=0.2)
-
-
-def test_the_evidence_s_work_is_the_size_of_its_arrays():
-    state = hio.init(CONFIG, jax.random.key(0))
-    start, window = evidence.read_evidence(CONFIG, state.grid, jnp.zeros(3))
-    stored = evidence.write_evidence(state.grid, start, window)
-    assert window.hits.shape == CONFIG.grid_shape  # so that both have as many voxels
-
-    def size(grid, *names):
-        arrays = grid.__dict__ | grid.surface.__dict__
-        return sum(arrays[name].nbytes for name in names)
-
-    fused, traced = ("hits", "weight", "mean", "axes"), ("passes", "behind")
-    every = {*fused, *traced}
-    work = limits.evidence_work(window.hits.size, 300, 50.0)
-    assert work["window"].memory == size(state.grid, *every) + size(window, *every)
-    assert work["fading"].memory == size(window, *every) + size(stored, *every)
-    assert work["fusion"].memory == 2 * size(window, *fused) + 300 * (12 + 1)
-    beams = place_cloud(CONFIG, jnp.ones((300, 3)), jnp.ones(300, bool), jnp.eye(4))
-    needed = (beams.directions_world, beams.free_ranges, beams.in_range, beams.ends)
-    read = sum(array.nbytes for array in needed)
-    assert work["rays"].memory == 2 * size(window, *traced) + read
-
-    def a_voxel(*names):
-        return size(state.grid, *names) / state.grid.evidence.hits.size
-
-    # One of nearest's three numbers, two of the three axes; a sample is written with its weight.
-    whole = size(state.grid, *traced, "hits", "sdf", "nearest") - 2 * state.grid.evidence.hits.size
-    asked = 8 * a_voxel("nearest", "sdf") + a_voxel("mean") + 2 / 3 * a_voxel("axes") + 5 * 4
-    samples = CONFIG.near_samples + CONFIG.far_samples
-    drawn = limits.grid_samples_work(CONFIG)
-    assert drawn.memory == pytest.approx(whole + asked * samples)
-    asked = 8 * a_voxel("nearest", "sdf", "doubt", "frontier") + a_voxel("mean", "axes") + 3 * 4
-    network = limits._network_work(CONFIG, 50, 1).memory
-    assert limits.calibration_work(CONFIG, 300, 50).memory == network + 300 + 50 * asked
-
-
-def test_steps_are_those_of_the_rays():
-    """They are counted by the grid that they are added to: two rays that end, one that does not."""
-    cloud = jnp.asarray([[0.55, 0, 0], [0, 0.45, 0], [0, 0, 5.0]])
-    config = dataclasses.replace(CONFIG, max_range=0.6)
-    beams = place_cloud(config, cloud, jnp.ones(3, bool), jnp.eye(4))
-    assert beams.ends.tolist() == [True, True, False]
-    start, window = evidence.read_evidence(config, evidence.empty_grid(config), beams.sensor_world)
-    traced = carving.trace_rays(config, window, start, beams)
-    counted = float(traced.passes.sum() + traced.behind.sum())
-    assert abs(tasks._steps(config, beams) - counted) < 1
 
 
 def test_a_row_stands_beside_its_baselines():
@@ -347,7 +345,10 @@ def test_the_share_is_that_of_the_narrowest_limit():
     assert name == "vector" and share == pytest.approx(0.5)
     name, share = limits.share(machine, limits.Work(memory=1e6), median_ms=4.0)
     assert name == "memory" and share == pytest.approx(0.25)
-    assert math.isnan(limits.share(None, limits.Work(), 1.0)[1])
+    row = limits.row(machine, "ours", rows.single(4.0), limits.Work(memory=1e6), "twice")
+    assert (row.limit, row.compare) == ("memory", "twice") and row.share == pytest.approx(0.25)
+    row = limits.row(machine, "ours", rows.single(4.0), None, "")
+    assert row.limit == "" and math.isnan(row.share)
 
 
 def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():

@@ -2,10 +2,11 @@
 
 python -m benchmarks.speed --stream ../shared/data/house_depth.npz
 
-- `tasks` says what is measured; `stages` takes an update apart;
-- `baselines` are the same work in scipy and, in `torch_siren`, in PyTorch;
-- `limits` measures the machine, and counts the work that a stage cannot avoid;
-- `rows` times, and lays the rows out as a table.
+- `setup` holds the sizes of a run, its configurations and its stream;
+- `plan` lists the tasks: `processes`, `updates`, `scaling`, `stages`, `networks` and `queries`;
+- `baselines` do the same work in scipy and, with `torch_siren`, in PyTorch;
+- `limits` measures the machine and counts the least work of some rows;
+- `rows` times, and lays the rows out as a table and a record.
 
-It needs neither mujoco nor trimesh nor matplotlib; without PyTorch its rows lack that baseline.
+It needs neither mujoco nor trimesh nor matplotlib. Without PyTorch its rows lack that baseline.
 """

@@ -1,4 +1,4 @@
-"""The command: all tasks, one table, one JSON file."""
+"""The command that runs all tasks and writes one table and one record."""
 
 from __future__ import annotations
 
@@ -11,23 +11,33 @@ import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 from tqdm import tqdm
 
 from benchmarks import records
-from benchmarks.speed.rows import Row, format_table, to_record
-from benchmarks.speed.tasks import FULL, OUT_OF_TIME, QUICK, Bench, Task, open_bench, plan
+from benchmarks.speed.plan import Task, plan
+from benchmarks.speed.rows import (
+    OUT_OF_TIME,
+    Baseline,
+    Baselines,
+    Measured,
+    Row,
+    format_table,
+    to_record,
+)
+from benchmarks.speed.setup import FULL, QUICK, Setup, open_setup
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the benchmark.
 
     Args:
-        arguments: Those after the command's name; by default those of the process.
+        arguments: Those after the command's name; those of the process if left out.
 
     Returns:
-        The exit code: 1 if a row failed.
+        The exit code, 1 if a row failed.
     """
     began = time.perf_counter()
     parser = _parser()
@@ -37,56 +47,63 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sizes = QUICK if options.quick else FULL
     if options.endurance is not None:
         sizes = dataclasses.replace(sizes, endurance=options.endurance)
-    bench = open_bench(options.stream, sizes, began + 60 * options.minutes)
-    tasks = list(plan(bench))
+    setup = open_setup(options.stream, sizes, began + 60 * options.minutes)
+    tasks = plan(setup)
     if options.only:
-        chosen = [task for task in tasks if any(part in task[0] for part in options.only)]
+        chosen = [name for name in tasks if any(part in name for part in options.only)]
         if not chosen:
-            names = ", ".join(repr(name) for name, _ in tasks)
+            names = ", ".join(map(repr, tasks))
             parser.error(f"--only {' '.join(options.only)}: in the name of no task: {names}")
-        tasks = chosen
+        tasks = {name: tasks[name] for name in chosen}
     rows: list[Row] = []
-    with tqdm(tasks, unit="task") as progress:
+    baselines: dict[str, Sequence[Baseline]] = {}
+    with tqdm(tasks.items(), unit="task") as progress:
         for name, task in progress:
             progress.set_description(name)
-            rows += _run(bench, name, task)
+            measured = _run(setup, name, task)
+            rows += measured.rows
+            baselines |= measured.baselines
             took_s = time.perf_counter() - began
-            _write(options.output, options.stream.stem, bench, rows, took_s)  # if it is cut off
+            record = _record(setup, rows, baselines, took_s)
+            records.write(options.output, record)  # a run that is cut off leaves its start
     device = jax.devices()[0].device_kind
     print(
         f"{options.stream.stem}, {device}, {_host()}, jax {jax.__version__}, {took_s:.0f} s in all"
     )
-    print(format_table(rows, bench.baselines))
+    print(format_table(rows, baselines))
     print(f"wrote {options.output}")
     return 1 if any(row.failed for row in rows) else 0
 
 
-def _run(bench: Bench, name: str, task: Task) -> list[Row]:
-    """Runs a task; one that fails gives a row that says why."""
-    if bench.out_of_time():
-        return [Row(name, note=OUT_OF_TIME)]
+def _run(setup: Setup, name: str, task: Task) -> Measured:
+    """Runs a task; one that fails gives a row with the reason."""
+    if setup.is_over():
+        return Measured([Row(name, note=OUT_OF_TIME)])
     try:
         return task()
     except Exception as error:
         traceback.print_exc()
-        # The first lines: what an accelerator runs out of comes with a long list of buffers.
+        # The first lines: an accelerator that is out of memory lists all its buffers.
         reason = " ".join(str(error).split())[:200]
-        return [Row(name, note=f"{type(error).__name__}: {reason}", failed=True)]
+        return Measured([Row(name, note=f"{type(error).__name__}: {reason}", failed=True)])
 
 
-def _write(path: Path, stream: str, bench: Bench, rows: list[Row], took_s: float) -> None:
-    baselines = bench.baselines.items()
-    record = {"stream": stream, "host": _host(), "took_s": records.rounded(took_s)}
-    record |= records.provenance() | {
-        "sizes": dataclasses.asdict(bench.sizes),
-        "rows": [to_record(row) for row in rows],
-        "baselines": {key: [to_record(one) for one in found] for key, found in baselines},
-    }
-    records.write(path, record)
+def _record(setup: Setup, rows: Sequence[Row], baselines: Baselines, took_s: float) -> Any:
+    head = {"stream": setup.path.stem, "host": _host(), "took_s": records.rounded(took_s)}
+    beside = {key: [to_record(one) for one in found] for key, found in baselines.items()}
+    return (
+        head
+        | records.provenance()
+        | {
+            "sizes": dataclasses.asdict(setup.sizes),
+            "rows": [to_record(row) for row in rows],
+            "baselines": beside,
+        }
+    )
 
 
 def _host() -> str:
-    """The host's processor and its cores."""
+    """Names the host's processor and counts its cores."""
     known = Path("/proc/cpuinfo")
     lines = known.read_text("utf-8").splitlines() if known.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -102,13 +119,13 @@ def _parser() -> argparse.ArgumentParser:
         "--stream", type=Path, default=Path("../shared/data/house_depth.npz"), metavar="FILE"
     )
     parser.add_argument(
-        "--quick", action="store_true", help="smaller sizes, for two CPU cores: light alone"
+        "--quick", action="store_true", help="smaller sizes and light alone, for two CPU cores"
     )
     parser.add_argument(
         "--only",
         nargs="+",
         metavar="PART",
-        help="tasks with one of these in their names (stages and queries need an update's task)",
+        help="run only the tasks with one of these in their names",
     )
     parser.add_argument(
         "--endurance",
@@ -120,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
         "--minutes",
         type=float,
         default=8.0,
-        help="then the updates in a row stop, and what is left is not run (default: %(default)s)",
+        help="time limit, after which the remaining tasks are not run (default: %(default)s)",
     )
     parser.add_argument(
         "--output",

@@ -1,4 +1,4 @@
-"""The work of some rows done by other libraries, in the same process and on the same data."""
+"""The work of some rows, done by other libraries in the same process on the same data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hiosdf_jax._src.state import Network
 
 
 def training(config: Config, network: Network, samples: Samples, seconds: float) -> list[Baseline]:
-    """The paper's training: every sample with its slope, all samples a step."""
+    """Times the paper's training: every sample with its slope, all samples in each step."""
     epochs = config.epochs
     label = f"PyTorch eager, {epochs} epochs of {samples.sdf.size:,}"
 
@@ -39,10 +39,10 @@ def training(config: Config, network: Network, samples: Samples, seconds: float)
 def network_query(
     config: Config, network: Network, points: jax.Array, seconds: float
 ) -> list[Baseline]:
-    """Values and gradients of the paper's network at points relative to its origin."""
+    """Times values and gradients of the paper's network at points relative to its origin."""
 
     def measure(torch: Any, siren: Any, device: str) -> Spread:
-        model = _model(siren, config, network.served).to(device)
+        model = _model(siren, config, network.average).to(device)
         tensor = torch.tensor(np.asarray(points), device=device)
         return time_ms(
             lambda: siren.value_and_gradient(model, tensor),
@@ -54,28 +54,28 @@ def network_query(
 
 
 def nearest(queries: np.ndarray, points: np.ndarray, seconds: float) -> list[Baseline]:
-    """Distances to the nearest point of a cloud that is new, so that its tree is too."""
+    """Times distances to the nearest point of a new cloud, the building of its tree included."""
 
     def measure(spatial: Any) -> Spread:
         return time_ms(lambda: spatial.cKDTree(points).query(queries, workers=-1), seconds=seconds)
 
-    return _by_scipy("scipy cKDTree on the CPU, built and asked", "spatial", measure)
+    return _by_scipy("scipy cKDTree on the CPU, built and queried", "spatial", measure)
 
 
 def distance(features: np.ndarray, doubtful: np.ndarray, seconds: float) -> list[Baseline]:
-    """Nearest feature voxels, and distances to doubtful ones, of the same window."""
+    """Times the search for feature voxels and for doubtful ones in the same window."""
     return _by_transforms(
         "twice", lambda edt: (edt(~features, return_indices=True), edt(~doubtful)), seconds
     )
 
 
-def frontier(seen: np.ndarray, seconds: float) -> list[Baseline]:
-    """Distances from seen voxels to unseen ones and back, of the same window."""
-    return _by_transforms("both ways", lambda edt: (edt(seen), edt(~seen)), seconds)
+def frontier(observed: np.ndarray, seconds: float) -> list[Baseline]:
+    """Times distances from observed voxels to unobserved ones and back in the same window."""
+    return _by_transforms("both ways", lambda edt: (edt(observed), edt(~observed)), seconds)
 
 
 def _by_transforms(how: str, transforms: Callable[[Any], Any], seconds: float) -> list[Baseline]:
-    """Measures what is given scipy's exact distance transform."""
+    """Times a function of scipy's exact distance transform."""
 
     def measure(ndimage: Any) -> Spread:
         return time_ms(lambda: transforms(ndimage.distance_transform_edt), seconds=seconds)
@@ -84,7 +84,7 @@ def _by_transforms(how: str, transforms: Callable[[Any], Any], seconds: float) -
 
 
 def _by_torch(label: str, measure: Callable[[Any, Any, str], Spread]) -> list[Baseline]:
-    """Measures in float32 and, on a GPU, with TF32 products."""
+    """Times in float32 and, on a GPU, with TF32 products too."""
     try:
         torch = importlib.import_module("torch")
         siren = importlib.import_module("benchmarks.speed.torch_siren")

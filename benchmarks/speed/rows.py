@@ -1,4 +1,4 @@
-"""Timing, and the rows of the table."""
+"""Timing, and the rows of the table and the record."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from hiosdf_jax._src.scoring.metrics import lay_out
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """Of repeated measurements; p99 of fewer than a hundred is next to their maximum."""
+    """Percentiles of repeated measurements; p99 of fewer than a hundred is near their maximum."""
 
     median: float
     p10: float
@@ -28,7 +29,7 @@ class Spread:
 
 @dataclasses.dataclass(frozen=True)
 class Baseline:
-    """The same work done otherwise: how long it took, or why it was not measured."""
+    """The same work done another way: how long it took, or why it was not measured."""
 
     name: str
     spread: Spread | None
@@ -41,13 +42,13 @@ class Row:
 
     Attributes:
         name: What was measured.
-        unit: Of the spread.
-        spread: What came out; None for a row that has no numbers, as the note says.
-        compare: Key of the baselines that the row stands beside; "" if it has none.
-        limit: What bounds it: "matrix", "vector" or "memory"; "" where no bound is stated.
-        share: The time of that bound over the median.
-        note: Whatever else is to be known.
-        failed: It should have had numbers.
+        unit: Unit of the spread.
+        spread: The result; None for a row without numbers, for the reason in the note.
+        compare: Key of the baselines beside the row; "" if it has none.
+        limit: Its narrowest limit, "matrix", "vector" or "memory"; "" where none is stated.
+        share: The time at that limit, divided by the median.
+        note: A remark.
+        failed: Whether numbers are missing because of an error.
     """
 
     name: str
@@ -63,15 +64,30 @@ class Row:
 Baselines = Mapping[str, Sequence[Baseline]]
 
 
+class Measured(NamedTuple):
+    """The result of a task.
+
+    Attributes:
+        rows: The rows, which may name baselines of other tasks.
+        baselines: Baselines by the key that rows name.
+    """
+
+    rows: list[Row]
+    baselines: Baselines = MappingProxyType({})
+
+
+OUT_OF_TIME = "not run: --minutes are over"
+
+
 def spread_of(values: Iterable[float]) -> Spread:
-    """Percentiles of measurements, of which there is at least one."""
+    """Computes the percentiles of at least one measurement."""
     array = np.asarray(list(values), float)
     median, p10, p90, p99 = (float(x) for x in np.percentile(array, (50, 10, 90, 99)))
     return Spread(median, p10, p90, p99, len(array))
 
 
 def single(value: float) -> Spread:
-    """A value that was measured once."""
+    """Wraps a value that was measured once."""
     return Spread(value, value, value, value, 1)
 
 
@@ -95,16 +111,16 @@ def time_ms(
     seconds: float,
     block: Callable[[Any], Any] = jax.block_until_ready,
 ) -> Spread:
-    """Times a function, warmed up, until `seconds` are over: 5 to 300 times.
+    """Times a function after two calls that warm up.
 
     Args:
-        function: Compiled, if it is to be.
+        function: The function.
         *arguments: Its arguments.
-        seconds: How long to go on.
+        seconds: How long to repeat it; it is called 5 to 300 times.
         block: Waits until a result is there.
 
     Returns:
-        ms.
+        The times, ms.
     """
     for _ in range(2):
         block(function(*arguments))
@@ -117,7 +133,7 @@ def time_ms(
 
 
 def format_table(rows: Sequence[Row], baselines: Baselines) -> str:
-    """Lays rows out for a terminal, each with its baselines under one another.
+    """Lays rows out for a terminal, each with its baselines below one another.
 
     The last column is the row's median as a multiple of the baseline's.
     """
@@ -149,7 +165,7 @@ def format_table(rows: Sequence[Row], baselines: Baselines) -> str:
 
 
 def _align(cells: list[list[str]]) -> str:
-    """As `lay_out`, with text in the columns for it: names, units, limits and baselines."""
+    """Lays cells out with names, units, limits and baselines as text, aligned to the left."""
     text = [0, 1, 6, 8]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
 
@@ -161,7 +177,7 @@ def _align(cells: list[list[str]]) -> str:
 
 
 def _compare(spread: Spread | None, baseline: Baseline) -> tuple[str, str, str]:
-    """Name and median of a baseline, and the row's median as a multiple of it."""
+    """Returns name and median of a baseline, and the row's median as a multiple of it."""
     if baseline.spread is None:
         return f"{baseline.name}: {baseline.reason}", "none", ""
     multiple = "" if spread is None else format_number(spread.median / baseline.spread.median)

@@ -1,125 +1,144 @@
-"""An update taken apart: each stage with the arguments that `mapping._integrate` gives it."""
+"""Task that times the stages of an update one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+import functools
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
 
-from hiosdf_jax._src.field.points import field_of
-from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches
-from hiosdf_jax._src.grid.change import change_by
-from hiosdf_jax._src.grid.rays import place_cloud
-from hiosdf_jax._src.mapping import calibration, pipeline
-from hiosdf_jax._src.network import training
-from hiosdf_jax._src.samples import from_grid
-from hiosdf_jax._src.samples.draw import concatenate
-from hiosdf_jax._src.samples.from_cloud import sample_local
-from hiosdf_jax._src.state import MapState
+from benchmarks.speed import baselines, limits
+from benchmarks.speed.rows import Measured, time_ms
+from benchmarks.speed.setup import Frame
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid import evidence, geometry, patches
+from hiosdf_jax._src.grid.windows import RayBox, Window, box_of_rays, place_windows
+from hiosdf_jax._src.mapping import intake
+from hiosdf_jax._src.mapping.stages import STAGES, Step, begin
+from hiosdf_jax._src.state import Evidence, MapState
+
+_COMPARE = {
+    "update_distances": "distance",
+    "update_frontier": "frontier",
+    "sample_cloud": "nearest",
+    "train": "training",
+}
 
 
-class Stage(NamedTuple):
-    """A compiled stage, its arguments, and what it answered."""
+class Part(NamedTuple):
+    """A stage of one update.
 
-    name: str
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    result: Any
+    Attributes:
+        changes: The compiled stage, which returns the parts that it changes and None for others.
+        before: The step that it takes.
+        after: The step with these parts changed.
+    """
+
+    changes: Callable[[Step], Step]
+    before: Step
+    after: Step
 
 
-def take_apart(state: MapState, cloud: jax.Array, pose: jax.Array) -> dict[str, Stage]:
+def take_apart(state: MapState, frame: Frame) -> dict[str, Part]:
     """Runs an update stage by stage.
 
     Args:
         state: The map.
-        cloud: (max_points, 3) m, sensor frame.
-        pose: (4, 4) T_world_sensor.
+        frame: The update's cloud and pose.
 
     Returns:
-        The stages by name, in their order.
+        The stages by name, in order.
     """
-    config = state.config
-    _, grid_key, local_key, order_key, check_key = jax.random.split(state.key, 5)
-    cloud, pose = jnp.asarray(cloud, jnp.float32), jnp.asarray(pose, jnp.float32)
-    finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    beams = jax.jit(place_cloud, static_argnums=0)(config, cloud, finite, pose)
-    sensor_world = beams.sensor_world
-    stages: dict[str, Stage] = {}
+    cloud, pose = map(jnp.asarray, intake.prepare(*frame, state.config.max_points))
+    step = jax.jit(begin)(state, cloud, jnp.all(jnp.isfinite(cloud), axis=-1), pose)
+    parts = {}
+    for stage in STAGES:
+        changes = jax.jit(functools.partial(_changes, stage))
+        after = jax.tree.map(
+            lambda old, new: old if new is None else new,
+            step,
+            changes(step),
+            is_leaf=lambda part: part is None,
+        )
+        parts[stage.__name__] = Part(changes, step, after)
+        step = after
+    return parts
 
-    def stage(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        compiled = jax.jit(function)
-        result = jax.block_until_ready(compiled(*arguments))
-        stages[name] = Stage(name, compiled, arguments, result)
-        return result
 
-    def fade(grid: Any, start: jax.Array, window: Any) -> Any:
-        return evidence.write_evidence(grid, start, evidence.fade_evidence(config, window))
+def time_parts(
+    label: str, parts: Mapping[str, Part], machine: limits.Limits, seconds: float
+) -> Measured:
+    """Times each stage of an update by itself, and scipy beside three of them.
 
-    stage(
-        "calibration",
-        calibration.calibrate,
-        field_of(state),
-        beams.points_world,
-        beams.ends & beams.inside,
-        sensor_world,
-        check_key,
+    Args:
+        label: Name of the configuration.
+        parts: The stages, from `take_apart`.
+        machine: The machine's rates.
+        seconds: How long to time each stage.
+
+    Returns:
+        Rows in ms by the stages' names.
+    """
+    step = parts["sample_cloud"].after
+    config, known = step.config, step.state.grid.evidence
+    box = box_of_rays(step.rays)
+    searched = _searched(config, box, config.horizon_voxels)
+    seen_in = _searched(config, box, config.frontier_voxels)
+    work = {
+        "update_distances": limits.distance_work(config, searched),
+        "train": limits.training_work(config),
+    }
+    rows = []
+    for name, part in tqdm(parts.items(), desc=label, leave=False):
+        spread = time_ms(part.changes, part.before, seconds=seconds)
+        compare = _COMPARE.get(name, "")
+        rows.append(limits.row(machine, f"{name}, {label}", spread, work.get(name), compare))
+    count = config.local_points * config.local_ray_samples
+    from_cloud = np.asarray(step.samples.points_world[-count:])
+    points = np.asarray(step.rays.points_world)[np.asarray(step.rays.ends)]
+    return Measured(
+        rows,
+        {
+            "nearest": baselines.nearest(from_cloud, points, seconds),
+            "distance": baselines.distance(*_sites(config, known, searched), seconds),
+            "frontier": baselines.frontier(_observed(known, seen_in), seconds),
+        },
     )
-    start, window = stage(
-        "window", partial(evidence.read_evidence, config), state.grid, sensor_world
+
+
+def _changes(stage: Callable[[Step], Step], step: Step) -> Step:
+    """Runs a stage without what it passes through: jit would copy the whole map."""
+    given = dict(jax.tree.leaves_with_path(step))
+    return jax.tree.map_with_path(
+        lambda path, leaf: None if given.get(path) is leaf else leaf, stage(step)
     )
-    window = stage(
-        "fusion",
-        partial(patches.fuse_hits, config),
-        window,
-        start,
-        beams.points_world,
-        beams.ends,
-        sensor_world,
+
+
+def _searched(config: Config, box: RayBox, horizon_voxels: int) -> Window:
+    """The window in which a stage recomputes its distances."""
+    small, large, fits = place_windows(config, box, horizon_voxels * config.voxel_size)
+    return small if fits else large
+
+
+def _sites(config: Config, known: Evidence, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """The voxels that the two searches of the distance transform look for."""
+    hits, passes, axes = (
+        geometry.read_window(array, window.start, window.shape)
+        for array in (known.hits, known.passes, known.axes)
     )
-    window = stage(
-        "rays",
-        partial(carving.trace_rays, config),
-        window,
-        start,
-        beams,
+    hits, passes = hits.astype(jnp.float32), passes.astype(jnp.float32)
+    features = patches.is_feature(config, hits, passes, axes)
+    return np.asarray(features), np.asarray(patches.is_doubtful(hits, passes))
+
+
+def _observed(known: Evidence, window: Window) -> np.ndarray:
+    """The voxels of a window that a ray has reached."""
+    passes, hits = (
+        geometry.read_window(array, window.start, window.shape)
+        for array in (known.passes, known.hits)
     )
-    grid = stage("fading", fade, state.grid, start, window)
-    change = change_by(beams)
-    grid = stage(
-        "distance",
-        partial(distance.update_distances, config),
-        grid,
-        change,
-    )
-    grid = stage(
-        "frontier",
-        partial(frontier.update_frontier, config),
-        grid,
-        change,
-    )
-    global_samples = stage(
-        "grid samples",
-        partial(from_grid.sample_grid, config),
-        grid,
-        grid_key,
-    )
-    local_samples = stage(
-        "local samples",
-        partial(sample_local, config),
-        beams.points_world,
-        beams.ends,
-        sensor_world,
-        local_key,
-    )
-    stage(
-        "training",
-        partial(training.train, config),
-        state.network,
-        concatenate(global_samples, local_samples),
-        *pipeline.schedule(config, state.updates),
-        order_key,
-    )
-    return stages
+    return np.asarray(evidence.is_observed(passes, hits))

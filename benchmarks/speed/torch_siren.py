@@ -1,7 +1,7 @@
-"""The paper's network and its training in plain PyTorch, eager: what our training stands beside.
+"""The paper's network and its training in plain, eager PyTorch, the baseline of our training.
 
-Written as one would at first: autograd for the gradient by the points, and once more through it
-for the weights (arXiv 2310.09463, sections IV-A and IV-D).
+Autograd computes the gradient by the points, and then differentiates through it for the weights
+(arXiv 2310.09463, sections IV-A and IV-D).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ class Siren(torch.nn.Module):
     """Layers of sin(omega_0 (W x + b)), and a linear output."""
 
     def __init__(self, layers: list[tuple[np.ndarray, np.ndarray]], frequency: float) -> None:
-        """Takes over weights.
+        """Copies weights.
 
         Args:
-            layers: Kernel (in, out) and bias (out,) of each, from input to output.
+            layers: Kernel (in, out) and bias (out,) of each layer, from input to output.
             frequency: omega_0.
         """
         super().__init__()
@@ -41,7 +41,10 @@ class Siren(torch.nn.Module):
 
 
 def value_and_gradient(model: Siren, points: Any, *, of_weights: bool = False) -> tuple[Any, Any]:
-    """Values (N,) at points (N, 3), and their gradients (N, 3); differentiable if `of_weights`."""
+    """Computes values (N,) and gradients (N, 3) at points (N, 3).
+
+    With `of_weights` both are differentiable by the weights.
+    """
     points = points.detach().requires_grad_()
     value = model(points)
     (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=of_weights)
@@ -49,17 +52,17 @@ def value_and_gradient(model: Siren, points: Any, *, of_weights: bool = False) -
 
 
 def loss(model: Siren, points: Any, sdf: Any, weight: Any, weights: tuple[float, float]) -> Any:
-    """Weighted sum of mean |f - s| and mean | |grad f| - 1 | (equations 4 and 5).
+    """Computes the weighted sum of mean |f - s| and mean | |grad f| - 1 | (equations 4 and 5).
 
     Args:
         model: The network.
         points: (N, 3) m, relative to the network's origin.
         sdf: (N,) m.
         weight: (N,) 0 or 1; samples of weight 0 are padding.
-        weights: Of the two parts of the loss.
+        weights: Weights of the two parts of the loss.
 
     Returns:
-        ().
+        The loss, ().
     """
     value, gradient = value_and_gradient(model, points, of_weights=True)
     count = weight.sum().clamp(min=1)
@@ -69,19 +72,19 @@ def loss(model: Siren, points: Any, sdf: Any, weight: Any, weights: tuple[float,
 
 
 def optimizer(model: Siren, learning_rate: float, weight_decay: float) -> Any:
-    """AdamW."""
+    """Makes the optimizer, AdamW."""
     return torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=weight_decay)
 
 
 def train(model: Siren, steps: Any, epochs: int, samples: Any, weights: tuple[float, float]) -> Any:
-    """Makes an update's epochs, each one step on all samples.
+    """Trains for some epochs, each one step on all samples.
 
     Args:
-        model: The network; it is changed.
-        steps: Its optimiser.
-        epochs: How many.
+        model: The network, changed in place.
+        steps: Its optimizer.
+        epochs: Number of epochs.
         samples: (points, sdf, weight), as `loss` takes them.
-        weights: Of the two parts of the loss.
+        weights: Weights of the two parts of the loss.
 
     Returns:
         The last loss, ().
