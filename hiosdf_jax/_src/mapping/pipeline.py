@@ -17,6 +17,7 @@ from hiosdf_jax._src.grid.change import change_by
 from hiosdf_jax._src.grid.rays import place_cloud
 from hiosdf_jax._src.mapping import calibration, intake
 from hiosdf_jax._src.network import training
+from hiosdf_jax._src.numerics.posed_cloud import check_shapes
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.samples import from_grid
 from hiosdf_jax._src.samples.draw import concatenate
@@ -92,9 +93,9 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
-    intake.check_shapes(cloud, pose)
     leaves = (*jax.tree.leaves(state), cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        check_shapes(cloud, pose)
         return _update(state, jnp.asarray(cloud), jnp.asarray(pose))
     compiled = _update_donating if donate else _update_jit
     return compiled(state, *intake.prepare(cloud, pose, state.config.max_points))
