@@ -11,6 +11,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.lattice import check_resolution, sample_counts
 from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.state import Field, MapState
 
 if TYPE_CHECKING:
@@ -40,13 +41,12 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     shape = sample_counts(high - low, resolution)
     count = math.prod(shape)
     sdf, observed = np.empty(count, np.float32), np.empty(count, bool)
-    for start in range(0, count, _CHUNK):
-        # The last sample repeated fills the last chunk up.
-        index = np.minimum(np.arange(start, start + _CHUNK), count - 1)
+
+    def sample(index: np.ndarray) -> tuple[jax.Array, jax.Array]:
         points_world = low + resolution * np.stack(np.unravel_index(index, shape), axis=-1)
-        values, seen = _sample(field, points_world.astype(np.float32))
-        # Written in full, the repeated ones with what they repeat.
-        sdf[index], observed[index] = np.asarray(values), np.asarray(seen)
+        return _sample(field, points_world.astype(np.float32))
+
+    fill_in_chunks(sample, {"sdf": sdf, "observed": observed}, _CHUNK)
     # Rays keep a margin before their end, so that between free space that was seen and the surface
     # lies up to about a voxel that nothing is known of.
     reach = max(1, math.ceil(field.config.voxel_size / resolution - 1e-6))
