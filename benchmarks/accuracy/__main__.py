@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.accuracy import figure, gate, results
 from benchmarks.accuracy.measure import measure, open_source
 from hiosdf_jax import Config
-from hiosdf_jax._src.command.run import to_json
+from hiosdf_jax._src.command.report import to_json
 
 _BASELINE = Path(__file__).parents[1] / "results" / "accuracy_baseline.json"
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from benchmarks.speed.rows import Row, format_table
 from benchmarks.speed.tasks import FULL, OUT_OF_TIME, QUICK, Bench, Task, open_bench, plan
-from hiosdf_jax._src.command.run import to_json
+from hiosdf_jax._src.command.report import to_json
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hiosdf_jax._src.scoring.metrics import lay_out
+from hiosdf_jax.scoring import lay_out
 
 
 @dataclasses.dataclass(frozen=True)
