@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from hiosdf_jax._src.command.run import to_json
+from hiosdf_jax._src.command.report import to_json
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

@@ -1,12 +1,19 @@
-"""Readers of recorded streams, one file each; `stream.Stream` is what they have in common."""
+"""Readers of recorded streams, one module per layout, behind one protocol (`Stream`).
+
+from hiosdf_jax import datasets
+
+stream = datasets.open_stream("house_depth.npz")
+bounds, max_range = datasets.find_bounds(stream)
+"""
 
 from hiosdf_jax._src.datasets.clouds import cloud_stream
 from hiosdf_jax._src.datasets.kitti import kitti_stream
-from hiosdf_jax._src.datasets.npz import NpzStream, ground_truth
+from hiosdf_jax._src.datasets.npz import NpzStream, read_truth
 from hiosdf_jax._src.datasets.open import FORMATS, open_stream
 from hiosdf_jax._src.datasets.replicacad import replicacad_stream
 from hiosdf_jax._src.datasets.rosbag import rosbag_stream
 from hiosdf_jax._src.datasets.scannet import scannet_stream
+from hiosdf_jax._src.datasets.sensors import depth_to_cloud, ranges_to_cloud
 from hiosdf_jax._src.datasets.stream import (
     BadFrameError,
     Extent,
@@ -15,6 +22,7 @@ from hiosdf_jax._src.datasets.stream import (
     find_bounds,
     read_frame,
 )
+from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.datasets.tum import tum_stream
 
 __all__ = [
@@ -22,14 +30,17 @@ __all__ = [
     "BadFrameError",
     "Extent",
     "FrameStream",
+    "GroundTruth",
     "NpzStream",
     "Stream",
     "cloud_stream",
+    "depth_to_cloud",
     "find_bounds",
-    "ground_truth",
     "kitti_stream",
     "open_stream",
+    "ranges_to_cloud",
     "read_frame",
+    "read_truth",
     "replicacad_stream",
     "rosbag_stream",
     "scannet_stream",

@@ -1,4 +1,4 @@
-"""Maps as pictures, drawn without a display."""
+"""Pictures of maps, drawn without a display."""
 
 from hiosdf_jax._src.view.shading import save_shaded
 from hiosdf_jax._src.view.slices import save_slices

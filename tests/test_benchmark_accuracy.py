@@ -18,10 +18,9 @@ import hiosdf_jax as hio
 from benchmarks import records
 from benchmarks.accuracy import __main__ as command
 from benchmarks.accuracy import figure, gate, measure, results
-from hiosdf_jax import datasets
-from hiosdf_jax._src.command import run
+from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.grid.lookup import grid_sdf
-from hiosdf_jax._src.scoring import metrics
+from hiosdf_jax._src.scoring import held_out
 from hiosdf_jax._src.state import surface_of
 
 FRAMES = 8
@@ -59,7 +58,7 @@ def tiny(monkeypatch):
 
     monkeypatch.setattr(hio.Config, "light", classmethod(light))
     monkeypatch.setattr(measure, "EARLY_FRAMES", 4)
-    monkeypatch.setattr(run, "_FIRST_HELD_OUT", 5)
+    monkeypatch.setattr(held_out, "_FIRST", 5)
     return given
 
 
@@ -74,7 +73,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
 
     # The same map, made and scored anew.
     path = tmp_path / "room.npz"
-    stream, truth = datasets.NpzStream(path), datasets.ground_truth(path)
+    stream, truth = datasets.NpzStream(path), datasets.read_truth(path)
     extent = datasets.find_bounds(stream)
     assert tiny[-1] == (extent.bounds, {"max_range": extent.max_range})
     states, state = [], hio.init(CONFIG, jax.random.key(0))
@@ -85,13 +84,13 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
 
     def score(state, frame, **settings):
         ask = functools.partial(hio.sdf_and_grad, hio.snapshot(state))
-        return metrics.evaluate(ask, truth, last_frame=frame, **settings)
+        return scoring.evaluate(ask, truth, last_frame=frame, **settings)
 
     record, real = json.loads(output.read_text())
     assert (record["stream"], record["seed"], record["frames"]) == ("room", 0, FRAMES)
     blended = record["variants"]["blended"]
     expected = score(state, FRAMES - 1, sensor_position_world=[0.5, 0, 0])
-    expected |= metrics.evaluate_lower(
+    expected |= scoring.evaluate_lower(
         lambda points: hio.query(state, points).lower, truth, FRAMES - 1
     )
     expected["early_then_cm"] = score(states[3], 3)["visible_cm"]
@@ -122,7 +121,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     median_cm = real["variants"]["grid"]["scores"]["median_cm"]
     assert median_cm == pytest.approx(np.median(error_cm), rel=1e-3)
     assert [entry["frame"] for entry in real["variants"]["grid"]["over_time"]] == [2, 7]
-    assert list(run.held_out_frames(FRAMES)) == [5]
+    assert list(scoring.held_out_frames(FRAMES)) == [5]
 
     saved = json.loads(baseline.read_text())
     assert saved["room"]["light"]["frames"] == FRAMES
@@ -362,7 +361,7 @@ def test_peers_have_the_published_figures():
     assert peers["house_depth"]["Voxfield 10 cm"]["visible_cm"] == [3.09]
     assert peers["house_lidar"]["HIO-SDF"]["recall"] == [0.793]
     known = {key for systems in peers.values() for row in systems.values() for key in row}
-    assert known <= metrics.METRICS.keys()
+    assert known <= scoring.METRICS.keys()
 
 
 def test_figure(tmp_path):
@@ -388,7 +387,7 @@ from pathlib import Path
 from benchmarks import records
 from benchmarks.accuracy import __main__, figure, measure
 assert not figure.save_figure(Path("never.png"), {}, {})
-from hiosdf_jax._src.scoring.metrics import GroundTruth
+from hiosdf_jax.scoring import GroundTruth
 from hiosdf_jax.datasets import FrameStream
 stream = FrameStream("s", 1, lambda i: (np.ones((3, 3)), np.eye(4)))
 truth = GroundTruth(*5 * [np.zeros((0, 3))])

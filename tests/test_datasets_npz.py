@@ -1,4 +1,4 @@
-"""Readers against a conversion one pixel at a time, and against the recorded ground truth."""
+"""The npz reader against a conversion pixel by pixel, and against recorded exact distances."""
 
 import math
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hiosdf_jax.datasets import BadFrameError, NpzStream, find_bounds, ground_truth
+from hiosdf_jax.datasets import NpzStream, find_bounds, read_truth
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.exists(), reason="needs ../shared/data")
@@ -71,7 +71,7 @@ def test_depth(tmp_path, invalid):
             np.testing.assert_allclose(cloud[5 * v + u], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_depth_in_metres_with_nan(tmp_path):
+def test_depth_in_meters_with_nan(tmp_path):
     depth = np.full((3, 4, 5), 1.5, np.float32)
     depth[2, 1, 1], depth[2, 1, 2] = np.nan, np.inf
     stream = NpzStream(write(tmp_path, DEPTH, depth=depth, depth_scale=np.float32(1)))
@@ -94,18 +94,18 @@ def test_range(tmp_path):
 def test_points(tmp_path):
     stream = NpzStream(write(tmp_path, POINTS))
     np.testing.assert_allclose(stream[0][0], POINTS["points_mm"][:4] / 1000, rtol=1e-6)
-    assert stream[1][0].shape == (0, 3)  # an empty scan is the map's to judge
+    assert stream[1][0].shape == (0, 3)  # an empty scan is for the map to refuse
     np.testing.assert_allclose(stream[2][0], POINTS["points_mm"][4:] / 1000, rtol=1e-6)
 
 
-def test_is_a_sequence(tmp_path):
+def test_a_stream_is_a_sequence(tmp_path):
     stream = NpzStream(write(tmp_path, RANGE))
     assert len(list(stream)) == 3
     np.testing.assert_array_equal(stream[-1][0], stream[2][0])
     for index in (3, -4):
         with pytest.raises(IndexError, match=f"frame {index}, expected one of 3"):
             stream[index]
-    stream[0][1][:] = 7  # what a caller does to its pose stays with the caller
+    stream[0][1][:] = 7  # changing a returned pose does not change the stream
     np.testing.assert_array_equal(stream[0][1], POSES[0])
 
 
@@ -147,14 +147,14 @@ def test_a_bad_pose_is_a_bad_frame(tmp_path):
         (POINTS, {"offsets": np.array([0, 4.5, 9])}, "expected .* integers"),
     ],
 )
-def test_bad_files_are_named(tmp_path, arrays, changes, message):
+def test_messages_of_bad_files_name_the_file_and_the_key(tmp_path, arrays, changes, message):
     path = write(tmp_path, arrays, **changes)
     with pytest.raises(ValueError, match=message) as error:
         NpzStream(path)
     assert str(path) in str(error.value)
 
 
-def test_files_that_are_no_npz(tmp_path):
+def test_files_that_are_not_npz(tmp_path):
     with pytest.raises(FileNotFoundError):
         NpzStream(tmp_path / "none.npz")
     text = tmp_path / "text.npz"
@@ -163,7 +163,7 @@ def test_files_that_are_no_npz(tmp_path):
         NpzStream(text)
     single = tmp_path / "single.npy"
     np.save(single, np.ones(3))
-    with pytest.raises(ValueError, match="holds one array"):
+    with pytest.raises(ValueError, match="holds a single array"):
         NpzStream(single)
     cut = write(tmp_path, DEPTH)
     cut.write_bytes(cut.read_bytes()[:-200])
@@ -171,106 +171,18 @@ def test_files_that_are_no_npz(tmp_path):
         NpzStream(cut)
 
 
-def test_ground_truth(tmp_path):
-    assert ground_truth(write(tmp_path, DEPTH)) is None
-    truth = ground_truth(write(tmp_path, DEPTH | TRUTH))
+def test_truth(tmp_path):
+    assert read_truth(write(tmp_path, DEPTH)) is None
+    truth = read_truth(write(tmp_path, DEPTH | TRUTH))
     for value, key in zip(truth[:5], TRUTH, strict=True):
         np.testing.assert_allclose(value, TRUTH[key], rtol=1e-6)
-    assert truth.thin_points_world.shape == (0, 3)  # such files do not tell thin parts
+    assert truth.thin_points_world.shape == (0, 3)  # npz files do not mark thin parts
     assert truth.points_world.dtype == np.float32
     assert truth.frame.dtype == np.int32
     with pytest.raises(ValueError, match="key 'eval_visible_grad' is missing"):
-        ground_truth(write(tmp_path, DEPTH | TRUTH, eval_visible_grad=None))
+        read_truth(write(tmp_path, DEPTH | TRUTH, eval_visible_grad=None))
     with pytest.raises(ValueError, match=r"eval_visible_sdf has shape \(5,\), expected \(6,\)"):
-        ground_truth(write(tmp_path, DEPTH | TRUTH, eval_visible_sdf=np.ones(5)))
-
-
-class Room:
-    """A stream from inside a box, with a few returns that cannot be."""
-
-    low, high = np.array([-3.0, -2.0, 0.0]), np.array([4.0, 2.0, 2.5])
-
-    def __init__(self, strays=0, frames=4, points=8000):
-        rng = np.random.default_rng(0)
-        self.frames = []
-        for i in range(frames):
-            walls = rng.uniform(self.low, self.high, (points, 3))
-            axis, side = rng.integers(0, 3, points), rng.integers(0, 2, points)
-            walls[np.arange(points), axis] = np.where(side, self.high[axis], self.low[axis])
-            if strays:
-                walls[:strays] = rng.uniform(20, 500, (strays, 3)) * rng.choice([-1, 1], 3)
-            angle = 0.3 + i
-            pose = np.eye(4, dtype=np.float32)
-            pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-            pose[:3, 3] = [i / 10, 0, 1]
-            cloud = (walls - pose[:3, 3]) @ pose[:3, :3]
-            cloud[-5:] = np.nan
-            self.frames.append((cloud.astype(np.float32), pose))
-
-    def __len__(self):
-        return len(self.frames)
-
-    def __getitem__(self, index):
-        return self.frames[index]
-
-
-def test_bounds_of_a_room():
-    extent = find_bounds(Room(), margin=0.25)
-    np.testing.assert_allclose(extent.bounds[0], Room.low - 0.25, atol=1e-3)
-    np.testing.assert_allclose(extent.bounds[1], Room.high + 0.25, atol=1e-3)
-    assert all(type(value) is float for corner in extent.bounds for value in corner)
-    farthest = max(np.nanmax(np.linalg.norm(cloud, axis=-1)) for cloud, _ in Room())
-    assert farthest - 0.2 < extent.max_range <= farthest
-
-
-def test_strays_do_not_blow_the_bounds_up():
-    clean, strayed = find_bounds(Room()), find_bounds(Room(strays=6))
-    np.testing.assert_allclose(strayed.bounds, clean.bounds, atol=0.01)
-
-
-def test_a_single_sparse_scan_has_bounds():
-    extent = find_bounds(Room(frames=1, points=150), margin=0)
-    np.testing.assert_allclose(extent.bounds[0], Room.low, atol=0.05)
-    np.testing.assert_allclose(extent.bounds[1], Room.high, atol=0.05)
-
-
-def test_a_side_room_seen_briefly_is_kept():
-    room = Room(frames=30)
-    cloud, pose = room.frames[7]
-    beyond = np.random.default_rng(1).uniform([6, 0, 0], [6.4, 0.4, 0.4], (60, 3))
-    cloud[:60] = (beyond - pose[:3, 3]) @ pose[:3, :3]  # 0.025 % of all returns
-    assert 6.3 < find_bounds(room, margin=0).bounds[1][0] < 6.41
-
-
-def test_the_path_is_inside():
-    room = Room()
-    for i, (_, pose) in enumerate(room.frames):
-        pose[2, 3] += 10 * i  # above all that is seen
-        cloud = room.frames[i][0]
-        room.frames[i] = (cloud[cloud[:, 2] < 0], pose)  # it looks down
-    bounds = find_bounds(room, margin=0.1).bounds
-    assert bounds[1][2] == pytest.approx(31.1)
-
-
-def test_frames_without_use_are_passed_over():
-    room = Room()
-    expected = find_bounds(room)
-    bad = np.eye(4, dtype=np.float32)
-    bad[:3, :3] *= 50
-    room.frames += [
-        (np.full((5, 3), np.nan, np.float32), room.frames[0][1]),
-        (room.frames[0][0], np.full((4, 4), np.nan, np.float32)),
-        (room.frames[0][0], bad),
-        (np.empty((0, 3), np.float32), room.frames[0][1]),
-    ]
-    assert find_bounds(room, skip_bad_frames=True) == expected
-    with pytest.raises(BadFrameError, match=r"^frame 4: cloud has no finite row among its 5"):
-        find_bounds(room)
-    room.frames = room.frames[-4:]
-    with pytest.raises(ValueError, match="none of the 4 frames"):
-        find_bounds(room, skip_bad_frames=True)
-    with pytest.raises(ValueError, match="margin = -1"):
-        find_bounds(Room(), margin=-1)
+        read_truth(write(tmp_path, DEPTH | TRUTH, eval_visible_sdf=np.ones(5)))
 
 
 @needs_shared
@@ -291,7 +203,7 @@ def test_recorded_streams(name, frames, points):
     assert cloud.dtype == pose.dtype == np.float32
     assert np.isfinite(cloud).all(axis=-1).mean() > 0.5
     assert math.isclose(np.linalg.det(pose[:3, :3]), 1, abs_tol=1e-3)
-    has_truth = ground_truth(SHARED / f"{name}.npz") is not None
+    has_truth = read_truth(SHARED / f"{name}.npz") is not None
     assert has_truth == name.startswith("house")
 
 
@@ -301,14 +213,14 @@ def test_recorded_clouds_lie_on_the_exact_surface(name):
     from scipy.spatial import cKDTree
 
     path = SHARED / f"{name}.npz"
-    stream, truth = NpzStream(path), ground_truth(path)
+    stream, truth = NpzStream(path), read_truth(path)
     clouds = []
     for i in range(0, len(stream), 4):
         cloud, pose = stream[i]
         clouds.append(cloud[::7] @ pose[:3, :3].T + pose[:3, 3])
     cloud = np.concatenate(clouds)
     cloud = cloud[np.isfinite(cloud).all(axis=-1)]
-    # Neighbouring returns are some centimetres apart; a wrong convention puts them metres off.
+    # Neighboring returns are some centimeters apart; a wrong convention is meters off.
     assert np.median(cKDTree(cloud).query(truth.surface_points_world[::20])[0]) < 0.06
     (low, high), _ = find_bounds(stream)
     for points in (truth.points_world, truth.surface_points_world):

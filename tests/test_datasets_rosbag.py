@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, written here, against the closed form of the motion in them."""
+"""ROS 1 and ROS 2 bags, written here, against the closed form of the motion in them."""
 
 import re
 from types import SimpleNamespace
@@ -27,7 +27,7 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("gap", "V4"), ("z", "<f4"), ("rin
 
 
 def motion(stamp):
-    """The base in the odometry's frame: even, so that interpolation is exact."""
+    """The base in the odometry frame; the motion is uniform, so interpolation is exact."""
     time, pose = stamp - START, np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec([0, 0, TURN * time]).as_matrix()
     pose[:3, 3] = [1.5 * time, 2, -0.5 * time]
@@ -167,12 +167,12 @@ def check_stream(stream):
 def test_bags(tmp_path, kind, moving):
     path = write_bag(tmp_path / "drive", kind, moving=moving)
     check_stream(open_stream(path))
-    if kind != "ros1":  # a file of the folder alone
+    if kind != "ros1":  # a single file of the folder
         [file] = [each for each in path.iterdir() if each.suffix in (".db3", ".mcap")]
         check_stream(open_stream(file))
 
 
-def test_corrections_of_the_map_are_above_the_odometry(tmp_path):
+def test_map_corrections_above_the_odometry(tmp_path):
     correction = motion(START + 3)
     path = write_bag(tmp_path / "drive", "ros1", moving="tf")
     with Bag(tmp_path / "two", "sqlite3") as bag:
@@ -193,11 +193,11 @@ def test_corrections_of_the_map_are_above_the_odometry(tmp_path):
     np.testing.assert_allclose(pose, MOUNT, atol=1e-6)
 
 
-def test_which_topics(tmp_path):
+def test_topics_are_chosen_by_name(tmp_path):
     with Bag(tmp_path / "drive", "sqlite3") as bag:
         bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
         for time in np.arange(START, START + 1, 0.07):
-            bag.write_transform(time, "odom", "base", np.eye(4))  # of bad wheels
+            bag.write_transform(time, "odom", "base", np.eye(4))  # from bad wheels
             bag.write_odometry(time, "odom", "base", motion(time), "/good")
             bag.write_odometry(time, "odom", "body", motion(time), "/other")
         for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
@@ -215,9 +215,9 @@ def test_which_topics(tmp_path):
         open_stream(bag.path, cloud_topic="/points", odometry_topic="/other")
 
 
-def test_nothing_says_how_it_moves(tmp_path):
+def test_bags_without_motion_or_clouds(tmp_path):
     path = write_bag(tmp_path / "still", "sqlite3", moving="")
-    with pytest.raises(ValueError, match="nothing moves above the clouds' frame, lidar in base"):
+    with pytest.raises(ValueError, match="nothing moves above the cloud's frame, lidar in base"):
         open_stream(path)
     np.testing.assert_allclose(open_stream(path, world_frame="base")[0][1], MOUNT, atol=1e-6)
     path = write_bag(tmp_path / "apart", "ros1", moving="odometry", static=False)
@@ -230,7 +230,7 @@ def test_nothing_says_how_it_moves(tmp_path):
         open_stream(path)
 
 
-def test_clouds_of_one_recording_time(tmp_path):
+def test_clouds_recorded_at_the_same_time(tmp_path):
     with Bag(tmp_path / "drive", "sqlite3") as bag:
         for time in np.arange(START, START + 1, 0.07):
             bag.write_odometry(time, "odom", "lidar", motion(time))
@@ -263,7 +263,7 @@ def test_broken_bags(tmp_path, kind):
             open_stream(path)
 
 
-def test_kinds_of_points():
+def test_number_types_and_padding_of_points():
     def message(points, height=1, row_pad=0, big=False):
         types = {"f4": 7, "f8": 8, "i2": 3}
         fields = [

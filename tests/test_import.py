@@ -21,3 +21,13 @@ print(float(hio.sdf(state, [0.5, 0.5, 0.5])))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     float(done.stdout)
+
+
+def test_the_public_modules_import_without_drawing_libraries():
+    code = """
+import sys
+for name in ("matplotlib", "trimesh", "skimage", "tqdm"):
+    sys.modules[name] = None  # importing it raises ImportError
+import hiosdf_jax.datasets, hiosdf_jax.planning, hiosdf_jax.scoring, hiosdf_jax.view
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy.results import Figures
-from hiosdf_jax._src.scoring.metrics import METRICS
+from hiosdf_jax.scoring import METRICS
 
 _METRICS = ("visible_cm", "within_3m_cm", "eikonal", "cosine")
 _REAL_METRICS = ("median_cm", "mean_cm", "p90_cm")  # of streams without ground truth

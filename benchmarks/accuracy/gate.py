@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks import records
 from benchmarks.accuracy.results import describe, figures_of, meaning
-from hiosdf_jax._src.scoring.metrics import METRICS, format_score
+from hiosdf_jax.scoring import METRICS, format_score
 
 _ERRORS = 3.0
 _SHARE = 0.05

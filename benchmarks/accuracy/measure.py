@@ -17,12 +17,11 @@ from tqdm import tqdm
 
 import hiosdf_jax as hio
 from benchmarks import records
-from hiosdf_jax import datasets
-from hiosdf_jax._src.command import run
+from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field import blend
+from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.field.points import as_field
 from hiosdf_jax._src.grid import lookup
-from hiosdf_jax._src.scoring import metrics
 from hiosdf_jax._src.state import Field
 
 # Forgetting compares the error in the region of the first frames, right after them and at the end.
@@ -47,7 +46,7 @@ class Source(NamedTuple):
 
     name: str
     stream: datasets.Stream
-    truth: metrics.GroundTruth | None
+    truth: scoring.GroundTruth | None
     extent: datasets.Extent
     complete: bool
 
@@ -70,7 +69,7 @@ def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
         truth = demo.ground_truth(whole)
     else:
         whole = datasets.NpzStream(folder / f"{name}.npz")
-        truth = datasets.ground_truth(folder / f"{name}.npz")
+        truth = datasets.read_truth(folder / f"{name}.npz")
     count = len(whole) if frames is None else min(frames, len(whole))
     stream = datasets.FrameStream(name, count, whole.__getitem__)
     extent = datasets.find_bounds(stream)
@@ -101,7 +100,7 @@ def measure(
         extent.bounds, **({"max_range": extent.max_range} | overrides)
     )
     count = len(source.stream)
-    held_out = run.held_out_frames(count) if source.truth is None else range(0)
+    held_out = scoring.held_out_frames(count) if source.truth is None else range(0)
     held_out_world = _returns_of(source.stream, held_out, config)
     mapped = [frame for frame in range(count) if frame not in held_out]
     state = hio.init(config, jax.random.key(seed))
@@ -128,12 +127,10 @@ def measure(
             if source.truth is None:
                 scores = _score_held_out(field, ask, held_out_world)
             else:
-                scores = metrics.evaluate(ask, source.truth, pose[:3, 3], frame)
+                scores = scoring.evaluate(ask, source.truth, pose[:3, 3], frame)
                 if name == "blended":
-                    scores |= metrics.evaluate_lower(
-                        lambda points: _lower(field, points),  # noqa: B023 - called at once
-                        source.truth,
-                        frame,
+                    scores |= scoring.evaluate_lower(
+                        CompiledQueries(field).lower, source.truth, frame
                     )
             if ends_early:
                 early[name] = scores["visible_cm"]
@@ -143,9 +140,9 @@ def measure(
                 variant["scores"] = scores
             if is_last and source.truth is not None:
                 truth = source.truth
-                variant["bands"] = metrics.evaluate_bands(ask, truth, pose[:3, 3], frame)
+                variant["bands"] = scoring.evaluate_bands(ask, truth, pose[:3, 3], frame)
                 if name in early:
-                    first = metrics.evaluate(ask, truth, last_frame=EARLY_FRAMES - 1)
+                    first = scoring.evaluate(ask, truth, last_frame=EARLY_FRAMES - 1)
                     scores["early_then_cm"] = early[name]
                     scores["early_now_cm"] = first["visible_cm"]
     return {
@@ -171,8 +168,6 @@ VARIANTS: dict[str, Callable[..., tuple[jax.Array, jax.Array]]] = {
     "network": jax.jit(blend.network_sdf_and_grad),
     "blended": hio.sdf_and_grad,  # compiled already
 }
-_lower = jax.jit(lambda field, points: hio.query(field, points).lower)
-_observed = jax.jit(lambda field, points: hio.query(field, points).observed)
 
 
 def _asking(name: str, field: Field) -> Callable[[np.ndarray], tuple[Any, Any]]:
@@ -185,7 +180,7 @@ def _returns_of(stream: datasets.Stream, frames: range, config: hio.Config) -> n
     parts = [np.empty((0, 3), np.float32)]
     for frame in frames:
         cloud, pose = datasets.read_frame(stream, frame)
-        parts.append(run.draw_returns(cloud, pose, config, len(frames), rng))
+        parts.append(scoring.draw_returns(cloud, pose, config, len(frames), rng))
     return np.concatenate(parts)
 
 
@@ -193,24 +188,21 @@ def _score_held_out(
     field: Field, ask: Callable[[np.ndarray], tuple[Any, Any]], points_world: np.ndarray
 ) -> dict[str, float]:
     """Scores a map on returns of other frames, earlier and later, where it has seen the place."""
-    if not len(points_world):  # the stream is too short to hold frames out
-        return {}
-    seen = points_world[np.asarray(_observed(field, points_world))]
-    return metrics.held_out_surface(lambda points: ask(points)[0], seen) if len(seen) else {}
+    observed = CompiledQueries(field).observed
+    scores = scoring.score_held_out(lambda points: ask(points)[0], observed, points_world)
+    return {key: value for key, value in scores.items() if key in scoring.METRICS}
 
 
 def _with_thin_parts(
-    mesh: Path, stream: datasets.Stream, truth: metrics.GroundTruth, max_range: float
-) -> metrics.GroundTruth:
-    from hiosdf_jax._src.scoring import visible
-
+    mesh: Path, stream: datasets.Stream, truth: scoring.GroundTruth, max_range: float
+) -> scoring.GroundTruth:
     try:
-        rays = visible.read_rays(stream, max_range)
-        scene = visible.read_scene(mesh, visible.sensor_path(rays))
+        rays = scoring.read_rays(stream, max_range)
+        scene = scoring.read_scene(mesh, scoring.sensor_path(rays))
     except (FileNotFoundError, ModuleNotFoundError) as error:
         print(f"thin parts are not scored: {error}")
         return truth
-    drawn = visible.sample_visible(scene, rays, count=len(stream))
+    drawn = scoring.sample_visible(scene, rays, count=len(stream))
     return truth._replace(thin_points_world=drawn.thin_points_world)
 
 

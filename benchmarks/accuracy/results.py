@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import records
-from hiosdf_jax._src.scoring.metrics import METRICS, format_score, lay_out
+from hiosdf_jax.scoring import METRICS, format_score, lay_out
 
 _PEERS = Path(__file__).with_name("peers.json")
 

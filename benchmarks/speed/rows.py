@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from benchmarks import records
-from hiosdf_jax._src.scoring.metrics import lay_out
+from hiosdf_jax.scoring import lay_out
 
 
 @dataclasses.dataclass(frozen=True)

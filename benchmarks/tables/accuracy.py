@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks import records
 from benchmarks.accuracy.results import load_peers
 from benchmarks.tables.markdown import lay_out
-from hiosdf_jax._src.scoring.metrics import format_score
+from hiosdf_jax.scoring import format_score
 
 _HOUSE = {"house_depth": "depth camera", "house_lidar": "LiDAR"}
 _REAL = {"kitchen_depth": "kitchen", "hall_lidar": "hall"}

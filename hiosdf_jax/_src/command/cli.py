@@ -10,22 +10,59 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-# Nothing heavy is imported up here: `hiosdf --help` answers at once.
+# Heavy imports are inside the functions, so that `hiosdf --help` responds at once.
 if TYPE_CHECKING:
     import numpy as np
 
     from hiosdf_jax._src.config import Config
-    from hiosdf_jax._src.scoring.metrics import GroundTruth
-    from hiosdf_jax.datasets import Stream
+    from hiosdf_jax._src.datasets.stream import Stream
+    from hiosdf_jax._src.datasets.truth import GroundTruth
 
 _NOTHING_MAPPED, _NOT_REACHED, _BAD_INPUT = 1, 1, 2  # exit codes; argparse itself exits with 2
 _OUTPUT = Path("hiosdf_output")
 _DEMO_FRAMES = 80
-_SKIP_HINT = " (--skip-bad-frames goes on without such frames)"
+_SKIP_HINT = " (--skip-bad-frames skips such frames)"
+
+_EXAMPLES = """\
+examples:
+  hiosdf demo                           map a simulated apartment, score the map and draw it
+  hiosdf demo --plan                    let a robot explore the apartment
+  hiosdf map house_depth.npz            map a recorded stream, score the map and draw it
+  hiosdf map --help                     streams, ground truth, and what else a run can do
+"""
+_DEMO_EXAMPLES = """\
+examples:
+  hiosdf demo --frames 20               the same path with fewer frames
+  hiosdf demo --config paper --seed 1   with the numbers of the paper
+  hiosdf demo --plan --seed 3           a robot drives from one room to another
+
+The folder gets metrics.json, slices.png, mesh.ply and mesh.png; with --plan it gets metrics.json,
+plan.png and plan.gif.
+"""
+_MAP_EXAMPLES = """\
+examples:
+  hiosdf map house_depth.npz --frames 20 --save map.npz
+      map the first 20 frames, and keep the map for hio.load("map.npz")
+  hiosdf map rgbd_dataset_freiburg1_desk
+      a TUM RGB-D sequence; the layout is recognized from the folder
+  hiosdf map drive/ --cloud-topic /points --odometry-topic /odom
+      a ROS bag with several clouds and no tf
+  hiosdf map scans/ --trajectory poses.txt --bounds -5 -5 0 5 5 3 --max-range 8
+      a folder of .ply or .pcd clouds; given both, bounds and range need no first pass
+  hiosdf map stream.npz --ground-truth house.ply
+      score the map against a mesh of the scene
+
+The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
+exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
+every tenth frame, which it is not given.
+
+A bad frame ends the mapping with exit code 2; the map of the frames before it is still scored,
+drawn and written.
+"""
 
 
 class _Failure(Exception):
-    """What ends the command with a line on stderr and an exit code."""
+    """Ends the command with one line on stderr and an exit code."""
 
     def __init__(self, message: object, code: int) -> None:
         super().__init__(message)
@@ -36,14 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command.
 
     Args:
-        arguments: Those after the command's name; by default those of the process.
+        arguments: The arguments after the command's name; by default those of the process.
 
     Returns:
-        The exit code: 0, 1 if no frame could be mapped or the robot did not come to its goal, 2 if
-        a file, a frame or a value is not what it should be.
+        The exit code: 0, 1 if no frame could be mapped or the robot did not reach its goal, 2 if a
+        file, a frame or a value is not as expected.
 
     Raises:
-        SystemExit: An argument is unknown or malformed, or help was asked for.
+        SystemExit: An argument is unknown or malformed, or help was requested.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -55,14 +92,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from hiosdf_jax import demo
+    from hiosdf_jax._src.demo import apartment
+    from hiosdf_jax._src.demo.primitives import signed_distance
 
     if options.plan:
         _plan(options)
         return
     frames = options.frames or _DEMO_FRAMES
-    stream = demo.ApartmentStream(frames=frames, seed=options.seed)
-    config = _configure(options.config, demo.BOUNDS_WORLD, max_range=stream.max_range)
+    stream = apartment.ApartmentStream(frames=frames, seed=options.seed)
+    config = _configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)
     print(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
     _run(
         stream,
@@ -70,15 +108,15 @@ def _demo(options: argparse.Namespace) -> None:
         options.output or _OUTPUT / "demo",
         name="demo",
         seed=options.seed,
-        truth=demo.ground_truth(stream),
-        exact_sdf=lambda points_world: demo.signed_distance(stream.model, points_world)[0],
+        truth=apartment.ground_truth(stream),
+        exact_sdf=lambda points_world: signed_distance(stream.model, points_world)[0],
     )
 
 
 def _plan(options: argparse.Namespace) -> None:
     for name in ("frames", "config"):
         if getattr(options, name) is not None:
-            raise _Failure(f"--{name} is not of --plan, which has its own", _BAD_INPUT)
+            raise _Failure(f"--{name} cannot be combined with --plan", _BAD_INPUT)
     try:
         from hiosdf_jax._src.demo import exploration, picture
     except ModuleNotFoundError as error:
@@ -90,65 +128,43 @@ def _plan(options: argparse.Namespace) -> None:
     output = options.output or _OUTPUT / "demo_plan"
     try:
         output.mkdir(parents=True, exist_ok=True)
-        print("a robot looks for its way through an apartment that it does not know")
+        print("a robot explores an apartment that it does not know")
         run = exploration.explore(options.seed)
         print("drawing plan.png and plan.gif")
         picture.write_run(output, run)
     except OSError as error:
-        raise _Failure(_told(error), _BAD_INPUT) from error
-    told = run.metrics
+        raise _Failure(_message(error), _BAD_INPUT) from error
+    metrics = run.metrics
     print(
-        f"from the {told['from']} to the {told['to']}: {told['path_m']:.1f} m in "
-        f"{told['robot_s']:.0f} s, {told['updates']} updates of the map, "
-        f"least clearance {100 * told['least_clearance_m']:.1f} cm"
+        f"from the {metrics['from']} to the {metrics['to']}: {metrics['path_m']:.1f} m in "
+        f"{metrics['robot_s']:.0f} s, {metrics['updates']} updates of the map, "
+        f"least clearance {100 * metrics['least_clearance_m']:.1f} cm"
     )
-    print(f"wrote {output}{os.sep} (the run took {told['wall_s']:.0f} s)")
-    if told["collided"]:
+    print(f"wrote {output}{os.sep} (the run took {metrics['wall_s']:.0f} s)")
+    if metrics["collided"]:
         raise _Failure("the robot collided", _NOT_REACHED)
-    if not told["reached"]:
-        raise _Failure("the robot did not come to its goal", _NOT_REACHED)
+    if not metrics["reached"]:
+        raise _Failure("the robot did not reach its goal", _NOT_REACHED)
 
 
 def _map(options: argparse.Namespace) -> None:
-    from hiosdf_jax import datasets
-
     if options.save is not None and not options.save.parent.is_dir():
         raise _Failure(f"{options.save.parent}: no such folder", _BAD_INPUT)
     if options.ground_truth is not None and not options.ground_truth.exists():
         raise _Failure(f"{options.ground_truth}: No such file or folder", _BAD_INPUT)
-    bounds, max_range = options.bounds, options.max_range
-    if bounds is not None:
-        bounds = (tuple(bounds[:3]), tuple(bounds[3:]))
-    overrides = {"max_range": max_range, "voxel_size": options.voxel_size}
+    overrides = {"max_range": options.max_range, "voxel_size": options.voxel_size}
     overrides = {name: value for name, value in overrides.items() if value is not None}
-    # Before minutes are spent on reading; on some box, if it is still to be found.
+    bounds = None
+    if options.bounds is not None:
+        bounds = (tuple(options.bounds[:3]), tuple(options.bounds[3:]))
+    # Checked before minutes are spent on reading; the bounds may still be unknown.
     _configure(options.config, bounds or ((0, 0, 0), (10, 10, 10)), **overrides)
-    names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
-    chosen = {name: getattr(options, name) for name in names}
-    chosen = {name: value for name, value in chosen.items() if value is not None}
-    stream = _checked(lambda: datasets.open_stream(options.stream, options.format, **chosen))
-    truth = None
-    if isinstance(stream, datasets.NpzStream) and options.ground_truth is None:
-        truth = _checked(lambda: datasets.ground_truth(options.stream))
-    if options.frames is not None:
-        count = min(options.frames, len(stream))
-        stream = datasets.FrameStream(options.stream, count, stream.__getitem__)
-    if bounds is None or max_range is None:
-        extent = _checked(
-            lambda: datasets.find_bounds(stream, skip_bad_frames=options.skip_bad_frames),
-            code=_NOTHING_MAPPED,
-        )
-        bounds = bounds or extent.bounds
-        max_range = max_range or math.ceil(10 * extent.max_range) / 10
-        (x0, y0, z0), (x1, y1, z1) = bounds
-        print(
-            f"bounds x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}, z {z0:.1f} to {z1:.1f} m; "
-            f"returns up to {max_range:.1f} m"
-        )
+    stream, truth = _open(options)
+    if bounds is None or options.max_range is None:
+        bounds, overrides["max_range"] = _complete(bounds, options, stream)
     exact_sdf = None
     if options.ground_truth is not None:
-        truth, exact_sdf = _ground_truth(options.ground_truth, stream, max_range)
-    overrides["max_range"] = max_range
+        truth, exact_sdf = _sample_truth(options.ground_truth, stream, overrides["max_range"])
     place = options.stream.absolute()
     _run(
         stream,
@@ -163,78 +179,125 @@ def _map(options: argparse.Namespace) -> None:
     )
 
 
-def _ground_truth(
+def _open(options: argparse.Namespace) -> tuple[Stream, GroundTruth | None]:
+    """Opens the stream, with the exact distances of its file unless others are given."""
+    from hiosdf_jax._src.datasets.npz import NpzStream, read_truth
+    from hiosdf_jax._src.datasets.open import open_stream
+    from hiosdf_jax._src.datasets.stream import FrameStream
+
+    names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
+    chosen = {name: getattr(options, name) for name in names}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    stream = _checked(lambda: open_stream(options.stream, options.format, **chosen))
+    truth = None
+    if isinstance(stream, NpzStream) and options.ground_truth is None:
+        truth = _checked(lambda: read_truth(options.stream))
+    if options.frames is not None:
+        count = min(options.frames, len(stream))
+        stream = FrameStream(options.stream, count, stream.__getitem__)
+    return stream, truth
+
+
+def _complete(bounds: Any, options: argparse.Namespace, stream: Stream) -> tuple[Any, float]:
+    """Completes bounds and range of the sensor in a first pass over the stream."""
+    from hiosdf_jax._src.datasets.stream import find_bounds
+
+    extent = _checked(
+        lambda: find_bounds(stream, skip_bad_frames=options.skip_bad_frames), code=_NOTHING_MAPPED
+    )
+    bounds = bounds or extent.bounds
+    max_range = options.max_range or math.ceil(10 * extent.max_range) / 10
+    (x0, y0, z0), (x1, y1, z1) = bounds
+    print(
+        f"bounds x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}, z {z0:.1f} to {z1:.1f} m; "
+        f"returns up to {max_range:.1f} m"
+    )
+    return bounds, max_range
+
+
+def _sample_truth(
     file: Path, stream: Stream, max_range: float
 ) -> tuple[GroundTruth, Callable[[np.ndarray], np.ndarray]]:
-    """Exact distances where the stream has seen, and to draw."""
-    from hiosdf_jax._src.scoring import visible
+    """Exact distances of a scene where the stream observed it, and the distances to draw."""
+    from hiosdf_jax._src.scoring import scene, visible
 
     rays = _checked(lambda: visible.read_rays(stream, max_range), code=_NOTHING_MAPPED)
-    scene = _checked(lambda: visible.read_scene(file, visible.sensor_path(rays)))
-    truth = _checked(lambda: visible.sample_visible(scene, rays))
-    return truth, scene.sdf_to_draw
+    exact = _checked(lambda: scene.read_scene(file, visible.sensor_path(rays)))
+    truth = _checked(lambda: visible.sample_visible(exact, rays))
+    return truth, exact.sdf_to_draw
 
 
 def _configure(name: str | None, bounds: Any, **overrides: float) -> Config:
+    import jax
+
     from hiosdf_jax._src.config import Config
 
-    return _checked(lambda: getattr(Config, name or "light")(bounds, **overrides))
+    if name is None:
+        name = "light" if jax.default_backend() == "cpu" else "default"
+    return _checked(lambda: getattr(Config, name)(bounds, **overrides))
 
 
 def _run(stream: Stream, config: Config, output: Path, **settings: Any) -> None:
-    from hiosdf_jax import datasets
-    from hiosdf_jax._src.command import run
+    from hiosdf_jax._src.command import map_stream
+    from hiosdf_jax._src.command.map_frames import NothingMappedError
+    from hiosdf_jax._src.datasets.stream import BadFrameError
 
     try:
-        run.run_stream(stream, config, output, **settings)
-    except datasets.BadFrameError as error:
+        map_stream.run_stream(stream, config, output, **settings)
+    except BadFrameError as error:
         raise _Failure(f"{error}{_SKIP_HINT}", _BAD_INPUT) from error
-    except run.NothingMappedError as error:
+    except NothingMappedError as error:
         raise _Failure(error, _NOTHING_MAPPED) from error
     except OSError as error:
-        raise _Failure(_told(error), _BAD_INPUT) from error
+        raise _Failure(_message(error), _BAD_INPUT) from error
 
 
 def _checked[Result](call: Callable[[], Result], code: int = _BAD_INPUT) -> Result:
-    """Calls, and makes one line of what is wrong with the input."""
-    from hiosdf_jax import datasets
+    """Calls a function, and turns its errors into a failure with a message of one line."""
+    from hiosdf_jax._src.datasets.stream import BadFrameError
 
     try:
         return call()
-    except datasets.BadFrameError as error:
+    except BadFrameError as error:
         raise _Failure(f"{error}{_SKIP_HINT}", _BAD_INPUT) from error
     except (OSError, ValueError, ModuleNotFoundError) as error:
-        raise _Failure(_told(error), code) from error
+        raise _Failure(_message(error), code) from error
 
 
-def _told(error: Exception) -> str:
+def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{os.fspath(error.filename)}: {error.strerror}"
     return " ".join(str(error).split())
 
 
 def _parser() -> argparse.ArgumentParser:
+    layout = argparse.RawDescriptionHelpFormatter  # keeps the line breaks of the examples
     parser = argparse.ArgumentParser(
-        prog="hiosdf", description="Signed distance fields from posed point clouds, online."
+        prog="hiosdf",
+        description="Signed distance fields from posed point clouds, online.",
+        epilog=_EXAMPLES,
+        formatter_class=layout,
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument(
         "--config",
         choices=("light", "paper", "default"),
-        help="light, the one you get without this, is sized for a CPU, default for a GPU, paper "
-        "has the paper's numbers",
+        help="size of the map: light suits a CPU, default a GPU, paper has the paper's numbers "
+        "(default: light on a CPU, default on a GPU)",
     )
     common.add_argument(
-        "--seed", type=_whole(0), default=0, help="of all randomness (default: %(default)s)"
+        "--seed", type=_whole(0), default=0, help="seed of all randomness (default: %(default)s)"
     )
 
     demo = commands.add_parser(
         "demo",
         parents=[common],
         help="map a simulated apartment and score the map",
-        description="Maps a simulated, furnished apartment, scores the map against exact "
-        "distances, and draws it; or, with --plan, lets a robot explore it.",
+        description="Map a simulated, furnished apartment, score the map against exact distances\n"
+        "and draw it. Or, with --plan, let a robot explore it.",
+        epilog=_DEMO_EXAMPLES,
+        formatter_class=layout,
     )
     demo.add_argument(
         "--output",
@@ -246,61 +309,26 @@ def _parser() -> argparse.ArgumentParser:
         "--frames",
         type=_whole(1),
         metavar="N",
-        help=f"frames along the camera's path (default: {_DEMO_FRAMES})",
+        help=f"number of frames along the camera's path (default: {_DEMO_FRAMES})",
     )
     demo.add_argument(
         "--plan",
         action="store_true",
-        help="instead, let a robot find its way to another room on nothing but its own map; needs "
-        "jax-mppi. --seed chooses start and goal as well",
+        help="let a robot drive to another room, knowing only its own map; --seed also chooses "
+        "start and goal; needs jax-mppi",
     )
     demo.set_defaults(command=_demo)
 
     map_ = commands.add_parser(
         "map",
         parents=[common],
-        help="map a recorded stream",
-        description="Maps a recorded stream, scores the map and draws it. Without exact distances "
-        "(eval_* of an .npz file, or --ground-truth) it is scored on frames that the map is not "
-        "given. A frame that cannot be used ends the mapping with exit code 2; what came before it "
-        "is written all the same.",
+        help="map a recorded stream and score the map",
+        description="Map a recorded stream of posed clouds, score the map and draw it.",
+        epilog=_MAP_EXAMPLES,
+        formatter_class=layout,
     )
     map_.add_argument(
-        "stream",
-        type=Path,
-        metavar="STREAM",
-        help="file or folder; hiosdf_jax/datasets/ has a description of each format",
-    )
-    map_.add_argument(
-        "--format",
-        metavar="NAME",
-        help="npz, replicacad, scannet, tum, kitti, clouds or rosbag (default: what the file or "
-        "folder looks like)",
-    )
-    map_.add_argument(
-        "--skip-bad-frames",
-        action="store_true",
-        help="pass over frames that cannot be read or have no usable pose, and count them",
-    )
-    map_.add_argument(
-        "--intrinsics",
-        type=float,
-        nargs=4,
-        metavar=("FX", "FY", "CX", "CY"),
-        help="of tum: pixels (default: by freiburg1, 2 or 3 in the folder's name)",
-    )
-    map_.add_argument(
-        "--trajectory",
-        type=Path,
-        metavar="FILE",
-        help="of clouds: the poses (default: the one .txt or .tum file in the folder)",
-    )
-    map_.add_argument("--cloud-topic", metavar="TOPIC", help="of rosbag, if it has several")
-    map_.add_argument(
-        "--odometry-topic", metavar="TOPIC", help="of rosbag, if tf does not say how it moves"
-    )
-    map_.add_argument(
-        "--world-frame", metavar="FRAME", help="of rosbag (default: the root of tf's tree)"
+        "stream", type=Path, metavar="STREAM", help="file or folder; see --format for the layouts"
     )
     map_.add_argument(
         "--output",
@@ -308,29 +336,72 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="folder for metrics and pictures (default: hiosdf_output/STREAM)",
     )
+    map_.add_argument("--save", type=Path, metavar="FILE", help="write the map, for hio.load(FILE)")
+    map_.add_argument("--frames", type=_whole(1), metavar="N", help="use only the first N frames")
     map_.add_argument(
-        "--bounds",
-        type=float,
-        nargs=6,
-        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="the mapped box, m, world (default: found in a first pass over the stream)",
+        "--skip-bad-frames",
+        action="store_true",
+        help="skip and count frames that cannot be read, have no return or no usable pose",
     )
-    map_.add_argument("--voxel-size", type=float, metavar="M", help="of the coarse grid")
-    map_.add_argument(
-        "--max-range",
-        type=float,
-        metavar="M",
-        help="farther returns leave no surface (default: found in the first pass)",
-    )
-    map_.add_argument("--frames", type=_whole(1), metavar="N", help="only the first N frames")
     map_.add_argument(
         "--ground-truth",
         type=Path,
         metavar="FILE",
-        help="score against the scene itself: a triangle mesh in the stream's world frame and in "
-        "metres, or a folder with sdf.npy and transform.txt as of iSDF",
+        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        "or a folder with iSDF's sdf.npy and transform.txt",
     )
-    map_.add_argument("--save", type=Path, metavar="FILE", help="write the map, for hio.load")
+
+    size = map_.add_argument_group("size of the map")
+    size.add_argument(
+        "--bounds",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="mapped box, m, world frame (default: found in a first pass over the stream)",
+    )
+    size.add_argument(
+        "--voxel-size", type=float, metavar="M", help="edge of a voxel, m (default: 0.1)"
+    )
+    size.add_argument(
+        "--max-range",
+        type=float,
+        metavar="M",
+        help="returns beyond this range, m, leave no surface (default: found in the first pass)",
+    )
+
+    layouts = map_.add_argument_group("layout of the stream")
+    layouts.add_argument(
+        "--format",
+        metavar="NAME",
+        help="npz, replicacad, scannet, tum, kitti, clouds or rosbag (default: recognized from the "
+        "file or folder)",
+    )
+    layouts.add_argument(
+        "--intrinsics",
+        type=float,
+        nargs=4,
+        metavar=("FX", "FY", "CX", "CY"),
+        help="tum: intrinsics in pixels (default: from freiburg1, 2 or 3 in the folder's name)",
+    )
+    layouts.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="clouds: file of poses (default: the only .txt or .tum file in the folder)",
+    )
+    layouts.add_argument(
+        "--cloud-topic", metavar="TOPIC", help="rosbag: topic of the clouds, if there are several"
+    )
+    layouts.add_argument(
+        "--odometry-topic",
+        metavar="TOPIC",
+        help="rosbag: topic of the odometry, if tf does not contain the motion",
+    )
+    layouts.add_argument(
+        "--world-frame",
+        metavar="FRAME",
+        help="rosbag: frame of the map (default: the root of the tf tree)",
+    )
     map_.set_defaults(command=_map)
     return parser
 

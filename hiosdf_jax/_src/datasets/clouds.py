@@ -1,11 +1,11 @@
 """A folder of point clouds with a trajectory.
 
-- `*.ply` or `*.pcd`: metres, sensor frame.
+- `*.ply` or `*.pcd`: m, sensor frame.
 - a trajectory in TUM's format, `timestamp tx ty tz qx qy qz qw` on each line: T_world_sensor.
 
-Clouds whose names are times within the trajectory's (seconds, or nanoseconds as whole numbers) get
-the pose interpolated at that time. Otherwise there must be as many poses as clouds: the poses
-belong to the clouds in the order of their names.
+If the file names are times within the trajectory (seconds, or nanoseconds as whole numbers), each
+cloud gets the pose interpolated at its time. Otherwise there must be as many poses as clouds, and
+the poses belong to the clouds in the order of their names.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.datasets.trajectory import Trajectory, pose_at, read_trajectory
+from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses
 
 _MAX_GAP = 0.2  # s
-_NANOSECONDS = 1e17  # a time from here on counts nanoseconds
+_NANOSECONDS = 1e17  # times from here on are in nanoseconds
 
 
 def cloud_stream(
@@ -31,25 +31,25 @@ def cloud_stream(
     """Opens a folder of PLY or PCD clouds with a trajectory.
 
     Args:
-        folder: With `*.ply` or `*.pcd`.
-        trajectory: The file of poses; by default the one .txt or .tum file in the folder.
+        folder: The folder with `*.ply` or `*.pcd`.
+        trajectory: The file of poses; by default the only .txt or .tum file in the folder.
 
     Returns:
-        The clouds as a stream, in the order of their times or names; one that cannot be read or
-        has no pose at its time is a bad frame.
+        The clouds as a stream, in the order of their times or names. A cloud that cannot be read
+        or has no pose at its time is a bad frame.
 
     Raises:
         FileNotFoundError: A file or folder is missing.
-        ValueError: The trajectory is malformed, or is not there, or does not fit the clouds.
+        ValueError: The trajectory is malformed, missing, or does not fit the clouds.
         ModuleNotFoundError: There are .pcd files and pypcd4 is not installed.
     """
     folder = Path(folder)
     clouds = sorted((p for p in folder.iterdir() if p.suffix in _READERS), key=_natural)
     if not clouds:
-        raise ValueError(f"{folder}: has no .ply or .pcd file")
+        raise ValueError(f"{folder}: has no .ply or .pcd file, expected at least one")
     if any(path.suffix == ".pcd" for path in clouds):
         _require_pypcd4()
-    poses = read_trajectory(_only_trajectory(folder) if trajectory is None else trajectory)
+    poses = read_timed_poses(_only_trajectory(folder) if trajectory is None else trajectory)
     stamps = _stamps(clouds, poses)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ def cloud_stream(
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sorts 2 before 10."""
+    """Sort key that puts 2 before 10."""
     return [(int(part), "") if part.isdigit() else (0, part) for part in _parts(path.stem)]
 
 
@@ -76,11 +76,11 @@ def _only_trajectory(folder: Path) -> Path:
     return found[0]
 
 
-def _stamps(clouds: list[Path], poses: Trajectory) -> np.ndarray:
-    """When each cloud was taken, (N,) s."""
+def _stamps(clouds: list[Path], poses: TimedPoses) -> np.ndarray:
+    """Time stamp of each cloud, (N,) s."""
     stamps = np.array([_stamp(path) for path in clouds])
     inside = (stamps >= poses.stamps[0]) & (stamps <= poses.stamps[-1])  # NaN is outside
-    if inside.mean() > 0.5:  # the trajectory may begin late or end early
+    if inside.mean() > 0.5:  # the trajectory may start late or end early
         return stamps
     if len(clouds) == len(poses.stamps):
         return poses.stamps
@@ -105,7 +105,7 @@ def _read_ply(path: Path) -> np.ndarray:
     with parsing(path, "PLY file"):
         vertices = getattr(trimesh.load(path, process=False), "vertices", None)
         cloud = np.zeros((0, 3)) if vertices is None else np.asarray(vertices)
-        # trimesh takes an ASCII file that is cut off after a line for a smaller cloud.
+        # trimesh reads an ASCII file that is cut off after a line as a smaller cloud.
         with open(path, "rb") as file:
             header = file.read(65536).split(b"end_header")[0].decode("ascii", "replace")
         count = re.search(r"^element vertex (\d+)", header, re.MULTILINE)
@@ -118,7 +118,7 @@ def _read_pcd(path: Path) -> np.ndarray:
 
     with parsing(path, "PCD file"):
         content = PointCloud.from_path(path)
-        cloud = content.numpy(("x", "y", "z")).reshape(-1, 3)  # of one point it gives a row
+        cloud = content.numpy(("x", "y", "z")).reshape(-1, 3)  # a single point comes as a row
         _check_count(cloud, content.metadata.points)
     return cloud
 

@@ -1,7 +1,6 @@
-"""Depth images in files, to clouds.
+"""Reads depth image files as clouds.
 
-Pillow decodes them: 16-bit PNG is all that is needed, and matplotlib brings Pillow along anyway
-(imageio would call it, too).
+Pillow decodes the 16-bit PNGs; matplotlib depends on it anyway.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ def pinhole(intrinsics: Sequence[float], source: object) -> np.ndarray:
     """Makes a camera matrix.
 
     Args:
-        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at integer coordinates.
-        source: Where they come from, for the message.
+        intrinsics: fx, fy, cx, cy in pixels, with pixel centers at integer coordinates.
+        source: Where the intrinsics come from, for the message.
 
     Returns:
         (3, 3) float64, K.
 
     Raises:
-        ValueError: There are not four, or they are not those of a camera.
+        ValueError: There are not four, one is not finite, or a focal length is not positive.
     """
     values = np.asarray(intrinsics, float)
     if values.shape != (4,) or not np.isfinite(values).all() or not (values[:2] > 0).all():
@@ -49,17 +48,17 @@ def read_depth(
     """Reads a depth image as a cloud.
 
     Args:
-        path: PNG of one channel of 16 bits; 0 is no return.
-        scale: Metres = value / scale along the optical axis.
+        path: PNG with one 16-bit channel; 0 is no return.
+        scale: m = value / scale, along the optical axis.
         matrix: (3, 3) K, pixels.
-        size: Width and height that K is made for; by default it is not checked.
+        size: Width and height that K belongs to; by default the size is not checked.
 
     Returns:
         (H * W, 3) float32 m, camera frame (x right, y down, z forward), NaN for no return.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not such an image; the message names it.
+        ValueError: The file is not such an image; the message names it.
     """
     from PIL import Image
 
@@ -67,7 +66,7 @@ def read_depth(
         raw = np.asarray(image)
     if raw.dtype not in (np.uint16, np.int32) or raw.ndim != 2:  # int32 is Pillow's mode "I"
         raise ValueError(
-            f"{path}: image of {raw.dtype} with shape {raw.shape}, expected one channel of 16 bits"
+            f"{path}: image of {raw.dtype} with shape {raw.shape}, expected one 16-bit channel"
         )
     if size is not None and raw.shape != size[::-1]:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Rows of numbers, numbered files, and what foreign parsers say of broken files."""
+"""Text files of numbers, numbered files, and errors of foreign parsers."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _Path = str | os.PathLike[str]
 
 
 def read_rows(path: _Path, columns: int) -> tuple[np.ndarray, list[int]]:
-    """Reads a text file of numbers between spaces; blank lines and those with # are left out.
+    """Reads a text file of numbers separated by spaces, without blank lines and # comments.
 
     Args:
         path: The file.
-        columns: How many numbers each line has.
+        columns: Numbers per line.
 
     Returns:
         (N, columns) float64 and the N line numbers, from 1.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: A line holds something else; the message names file and line.
+        ValueError: A line holds anything else; the message names file and line.
     """
     rows, lines = [], []
     for line, words in read_words(path, columns):
@@ -38,11 +38,11 @@ def read_rows(path: _Path, columns: int) -> tuple[np.ndarray, list[int]]:
 
 
 def read_words(path: _Path, columns: int) -> Iterator[tuple[int, list[str]]]:
-    """Goes through a text file of words; blank lines and those with # are left out.
+    """Reads a text file of words line by line, without blank lines and # comments.
 
     Args:
         path: The file.
-        columns: How many words each line has.
+        columns: Words per line.
 
     Yields:
         The line number, from 1, and the words.
@@ -51,7 +51,7 @@ def read_words(path: _Path, columns: int) -> Iterator[tuple[int, list[str]]]:
         FileNotFoundError: There is no such file.
         ValueError: A line has more words or fewer; the message names file and line.
     """
-    # What is not UTF-8 is not a number either, and is reported as such.
+    # Bytes that are not UTF-8 are no number either, and are reported as such.
     with open(path, encoding="utf-8", errors="replace") as file:
         for line, text in enumerate(file, 1):
             words = text.split()
@@ -63,10 +63,10 @@ def read_words(path: _Path, columns: int) -> Iterator[tuple[int, list[str]]]:
 
 
 def numbered_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
-    """Finds the files of a folder whose names hold a number.
+    """Finds the files of a folder whose names contain a number.
 
     Args:
-        folder: Where they lie.
+        folder: The folder.
         pattern: Regular expression of the whole name; its group is the number.
 
     Returns:
@@ -74,22 +74,22 @@ def numbered_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
 
     Raises:
         FileNotFoundError: There is no such folder.
-        ValueError: No name fits.
+        ValueError: No name matches.
     """
     matches = [(re.fullmatch(pattern, path.name), path) for path in folder.iterdir()]
     found = sorted((int(match[1]), path) for match, path in matches if match)
     if not found:
-        raise ValueError(f"{folder}: no file is named like {pattern}")
+        raise ValueError(f"{folder}: no file name matches {pattern}")
     return found
 
 
 @contextmanager
 def parsing(path: _Path, kind: str) -> Iterator[None]:
-    """Makes a ValueError that names the file of whatever a parser says of a broken one.
+    """Turns any error of a parser into a ValueError that names the file.
 
     Args:
         path: The file.
-        kind: What it should be, "PLY file".
+        kind: What the file should be, such as "PLY file".
 
     Raises:
         OSError: The file itself cannot be opened.
@@ -101,5 +101,5 @@ def parsing(path: _Path, kind: str) -> Iterator[None]:
         if error.filename is not None:
             raise
         raise ValueError(f"{path}: not a readable {kind} ({error})") from error
-    except Exception as error:  # parsers fail in every way on bytes that they did not expect
+    except Exception as error:  # parsers raise anything on unexpected bytes
         raise ValueError(f"{path}: not a readable {kind} ({error})") from error

@@ -1,12 +1,12 @@
 """LiDAR sequences of the KITTI odometry benchmark, and SemanticKITTI.
 
-- `velodyne/NNNNNN.bin`: float32 x y z reflectance, metres; x forward, y left, z up.
+- `velodyne/NNNNNN.bin`: float32 x y z reflectance, m; x forward, y left, z up.
 - `calib.txt`: the line `Tr:` has the 12 numbers of T_camera_velodyne.
-- `poses.txt` in the folder, or `../../poses/NAME.txt`: 12 numbers a line, T_world_camera of the
-  left grey camera; line i is scan i.
+- `poses.txt` in the folder, or `../../poses/NAME.txt`: 12 numbers per line, T_world_camera of the
+  left gray camera; line i is scan i.
 
-The world is the first frame of that camera: its y points down. Scans are taken as they are, without
-undoing the motion within one.
+The world is the first frame of that camera, so its y points down. Scans are used as recorded, with
+the motion within a scan not corrected.
 """
 
 from __future__ import annotations
@@ -17,24 +17,25 @@ from pathlib import Path
 import numpy as np
 
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
-from hiosdf_jax._src.datasets.poses import check_pose
 from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
-_BYTES = 16  # a point's
+_BYTES = 16  # per point
 
 
 def kitti_stream(folder: str | os.PathLike[str]) -> FrameStream:
     """Opens a sequence of the KITTI odometry benchmark.
 
     Args:
-        folder: Of one sequence, `sequences/00`, with `velodyne` and `calib.txt`.
+        folder: The folder of one sequence, such as `sequences/00`, with `velodyne` and
+            `calib.txt`.
 
     Returns:
-        The scans as a stream; one that is cut off or has no pose is a bad frame.
+        The scans as a stream. A scan that is cut off or has no pose is a bad frame.
 
     Raises:
         FileNotFoundError: A file or folder is missing.
-        ValueError: A file is not what it should be; the message names it and the line.
+        ValueError: A file is malformed; the message names it and the line.
     """
     folder = Path(folder).absolute()
     scans = numbered_files(folder / "velodyne", r"(\d+)\.bin")

@@ -1,15 +1,15 @@
 """Streams in one `.npz` file: a depth camera, a LiDAR's range images, or clouds one after another.
 
-Common to all: `poses` (F, 4, 4), T_world_sensor in metres. Then one of
+Every file has `poses` (F, 4, 4), T_world_sensor in m, and one of
 
-- `depth` (F, H, W), `K` (3, 3), `depth_scale`: metres = depth / depth_scale along the optical axis,
-  0 = no return, as are the values listed in `invalid` if it is there;
-- `range` (F, ...), `directions` (..., 3) unit vectors, `range_scale`: metres = range / range_scale,
-  0 = no return;
-- `points_mm` (P, 3) millimetres in the sensor frame, `offsets` (F + 1,): frame i is the rows
-  offsets[i] to offsets[i + 1].
+- `depth` (F, H, W), `K` (3, 3), `depth_scale`: m = depth / depth_scale along the optical axis;
+  0 is no return, as are the values listed in the optional `invalid`;
+- `range` (F, ...), `directions` (..., 3) unit vectors, `range_scale`: m = range / range_scale;
+  0 is no return;
+- `points_mm` (P, 3) mm, sensor frame, `offsets` (F + 1,): frame i has the rows offsets[i] to
+  offsets[i + 1].
 
-The `eval_*` arrays, where a file has them, are exact distances; see `ground_truth`.
+The optional `eval_*` arrays are exact distances, see `read_truth`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ import numpy as np
 from numpy.lib.npyio import NpzFile
 
 from hiosdf_jax._src.datasets import sensors
-from hiosdf_jax._src.datasets.poses import check_pose
 from hiosdf_jax._src.datasets.stream import frame_index
-from hiosdf_jax._src.scoring.metrics import GroundTruth
+from hiosdf_jax._src.datasets.truth import GroundTruth
+from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
 _depth_to_cloud = jax.jit(sensors.depth_to_cloud)
 _ranges_to_cloud = jax.jit(sensors.ranges_to_cloud)
 
 _Shape = tuple[int | str, ...]  # a letter stands for any length
 
-_LAYOUTS = {  # the key that tells a layout: what else it needs
+_LAYOUTS = {  # the key that identifies a layout: the other keys that it needs
     "depth": ("K", "depth_scale"),
     "range": ("directions", "range_scale"),
     "points_mm": ("offsets",),
@@ -41,25 +41,25 @@ _LAYOUTS = {  # the key that tells a layout: what else it needs
 
 
 class NpzStream:
-    """A `Stream` over one `.npz` file, converting one frame an item.
+    """A `Stream` over one `.npz` file, converted one frame at a time.
 
-    The raw arrays are held in memory as they are in the file (compressed npz files cannot be
-    mapped); only the frame asked for is turned into float32 metres.
+    The raw arrays are held in memory as they are in the file, since compressed npz files cannot be
+    memory-mapped. Each item is converted to float32 m.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Loads and checks a file.
 
-        Poses are not checked here beyond their count and shape: a pose that is not rigid makes a
-        bad frame, not a bad file.
+        Only the count and the shape of the poses are checked here: a pose that is not rigid makes
+        a bad frame, not a bad file.
 
         Args:
             path: The `.npz` file.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is not an npz file, or a key is missing, misshapen or out of range; the
-                message names the file, the key, what was found and what was expected.
+            ValueError: The file is no npz file, or a key is missing, misshapen or out of range;
+                the message names the file, the key, what was found and what was expected.
         """
         self.path = path
         with _open(path) as arrays:
@@ -94,7 +94,7 @@ class NpzStream:
             index: -len(self) <= index < len(self).
 
         Returns:
-            cloud: (N, 3) float32, metres, sensor frame; NaN for pixels or beams without return.
+            cloud: (N, 3) float32, m, sensor frame; NaN for pixels or rays without return.
             pose: (4, 4) float32, T_world_sensor, as it is in the file.
 
         Raises:
@@ -152,7 +152,7 @@ class NpzStream:
             i = falling[0]
             raise ValueError(
                 f"{self.path}: offsets of frame {i} run from {edges[i]} to {edges[i + 1]}, "
-                f"expected them never to fall"
+                f"expected offsets that never decrease"
             )
         return len(offsets) - 1
 
@@ -167,19 +167,20 @@ class NpzStream:
         return value
 
 
-def ground_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
+def read_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
     """Reads the exact distances of a file.
 
     Args:
         path: The `.npz` file, with all of `eval_visible` (N, 3), `eval_visible_sdf` (N,),
-            `eval_visible_grad` (N, 3), `eval_visible_frame` (N,), `eval_surface` (M, 3) or none.
+            `eval_visible_grad` (N, 3), `eval_visible_frame` (N,), `eval_surface` (M, 3) or none
+            of them.
 
     Returns:
         The exact distances, or None if the file has none of these keys.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not an npz file, or some of the keys are missing or misshapen.
+        ValueError: The file is no npz file, or some of the keys are missing or misshapen.
     """
     keys = ("visible", "visible_sdf", "visible_grad", "visible_frame", "surface")
     keys = tuple(f"eval_{key}" for key in keys)
@@ -210,7 +211,7 @@ def _open(path: str | os.PathLike[str]) -> NpzFile:
     except (zipfile.BadZipFile, EOFError, ValueError) as error:
         raise ValueError(f"{path}: not a readable npz file ({error})") from error
     if not isinstance(arrays, NpzFile):
-        raise ValueError(f"{path}: holds one array, expected an npz file of named arrays")
+        raise ValueError(f"{path}: holds a single array, expected an npz file of named arrays")
     return arrays
 
 
@@ -225,7 +226,7 @@ def _array(arrays: NpzFile, key: str, path: str | os.PathLike[str]) -> np.ndarra
 
 
 def _expect(array: np.ndarray, key: str, shape: _Shape, path: str | os.PathLike[str]) -> None:
-    """Raises unless array has the shape, in which a letter stands for any length."""
+    """Raises unless the array has the shape, where a letter stands for any length."""
     fits = array.ndim == len(shape) and all(
         isinstance(want, str) or have == want for have, want in zip(array.shape, shape, strict=True)
     )

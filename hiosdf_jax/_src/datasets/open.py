@@ -1,4 +1,4 @@
-"""Which layout a recorded stream has, told by the file or folder."""
+"""Opens a recorded stream in any layout, recognized by its file or folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hiosdf_jax._src.datasets.tum import tum_stream
 
 class _Format(NamedTuple):
     open: Callable[..., Stream]
-    sign: str  # by which it is known, in words
+    sign: str  # how to recognize it, in words
     fits: Callable[[Path], bool]
 
 
@@ -60,21 +60,25 @@ FORMATS = tuple(_FORMATS)
 
 
 def open_stream(path: str | os.PathLike[str], format: str | None = None, **options: Any) -> Stream:
-    """Opens a recorded stream in any of the layouts that there is a reader for.
+    """Opens a recorded stream in any layout that has a reader.
+
+    Example:
+        stream = open_stream("rgbd_dataset_freiburg1_desk")
+        for cloud, pose in stream:
+            state = hio.update(state, cloud, pose)
 
     Args:
         path: The file or folder.
-        format: One of `FORMATS`; by default what the file or folder looks like.
-        **options: Of that layout's reader: `intrinsics` of tum, `trajectory` of clouds,
-            `cloud_topic`, `odometry_topic` and `world_frame` of rosbag.
+        format: One of `FORMATS`; by default recognized from the file or folder.
+        **options: Options of the layout's reader: `intrinsics` for tum, `trajectory` for clouds,
+            `cloud_topic`, `odometry_topic` and `world_frame` for rosbag.
 
     Returns:
         The frames, read one at a time.
 
     Raises:
-        FileNotFoundError: It, or a file in it, is not there.
-        ValueError: The layout is not known or not clear, has no such option, or a file is not what
-            it should be.
+        FileNotFoundError: The path, or a file in it, does not exist.
+        ValueError: The layout is unknown or ambiguous, has no such option, or a file is malformed.
         ModuleNotFoundError: The layout needs a package that is not installed.
     """
     path = Path(path)
@@ -93,5 +97,7 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
     known = list(inspect.signature(opener).parameters)[1:]
     for name in options:
         if name not in known:
-            raise ValueError(f"{name} is not an option of format {format!r}, which has {known}")
+            raise ValueError(
+                f"{name} is not an option of format {format!r}, expected one of {known}"
+            )
     return opener(path, **options)

@@ -1,9 +1,9 @@
 """Sequences in the layout of iSDF's ReplicaCAD and of NICE-SLAM's Replica.
 
-- `traj.txt`: 16 numbers a line, T_world_camera row by row; line i is frame i.
+- `traj.txt`: 16 numbers per line, T_world_camera row by row; line i is frame i.
 - `results/depthNNNNNN.png`: 16 bits, depth along the optical axis; x right, y down, z forward.
-- `replicaCAD_info.json` (iSDF) or `cam_params.json` (NICE-SLAM), in the folder or the one above:
-  `camera` with w, h, fx, fy, cx, cy; `depth_scale`, or `scale` in `camera`: metres = value / scale.
+- `replicaCAD_info.json` (iSDF) or `cam_params.json` (NICE-SLAM), in the folder or its parent:
+  `camera` with w, h, fx, fy, cx, cy; `depth_scale`, or `scale` in `camera`: m = value / scale.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, parsing, read_rows
-from hiosdf_jax._src.datasets.poses import check_pose
 from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
 _INFO = ("replicaCAD_info.json", "cam_params.json")
 
@@ -27,14 +27,14 @@ def replicacad_stream(folder: str | os.PathLike[str]) -> FrameStream:
     """Opens a sequence in the layout of iSDF's ReplicaCAD or NICE-SLAM's Replica.
 
     Args:
-        folder: With `traj.txt` and `results`.
+        folder: The folder with `traj.txt` and `results`.
 
     Returns:
-        The depth images as a stream; an image without a usable pose is a bad frame.
+        The depth images as a stream. An image without a usable pose is a bad frame.
 
     Raises:
         FileNotFoundError: A file or folder is missing.
-        ValueError: A file is not what it should be; the message names it and the line.
+        ValueError: A file is malformed; the message names it and the line.
     """
     folder = Path(folder)
     images = numbered_files(folder / "results", r"depth(\d+)\.png")
@@ -53,11 +53,11 @@ def replicacad_stream(folder: str | os.PathLike[str]) -> FrameStream:
 
 
 def _camera(folder: Path) -> tuple[np.ndarray, float, tuple[int, int]]:
-    """K, the scale of the depth, and width and height."""
+    """Returns K, the depth scale, and (width, height)."""
     candidates = [place / name for place in (folder, folder.absolute().parent) for name in _INFO]
     path = next((path for path in candidates if path.is_file()), None)
     if path is None:
-        raise ValueError(f"{folder}: neither it nor the folder above has one of {list(_INFO)}")
+        raise ValueError(f"{folder}: neither it nor its parent folder has one of {list(_INFO)}")
     with parsing(path, "JSON file"):
         info: dict[str, Any] = json.loads(path.read_text("utf-8"))
     try:

@@ -1,11 +1,11 @@
 """ROS 1 and ROS 2 bags with PointCloud2 messages and tf or odometry.
 
-A cloud's pose is the product of the transforms from its frame up to the root of the tf tree, each
-interpolated at the cloud's own stamp. Where tf does not say how the robot moves, an odometry
-message is the transform from its `header.frame_id` to its `child_frame_id`. Clouds are taken as
-they are, without undoing the motion within a sweep.
+The pose of a cloud is the product of the transforms from its frame up to the root of the tf tree,
+each interpolated at the stamp of the cloud. If tf does not contain the motion of the robot, an
+odometry message is the transform from its `header.frame_id` to its `child_frame_id`. Clouds are
+used as recorded, with the motion within a sweep not corrected.
 
-The `rosbags` package reads both kinds of bag, without ROS.
+The `rosbags` package reads both kinds of bag without ROS.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.datasets.trajectory import Trajectory
+from hiosdf_jax._src.datasets.timed_poses import TimedPoses
 from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
 
 if TYPE_CHECKING:
@@ -47,19 +47,19 @@ def rosbag_stream(
 
     Args:
         path: A `.bag`, `.mcap` or `.db3` file, or the folder of a ROS 2 bag.
-        cloud_topic: Of the PointCloud2 messages; needed where there are several.
-        odometry_topic: Of Odometry messages, which then replace what tf says of their child frame;
-            by default they are used where there is one topic and tf has nothing that moves.
-        world_frame: In which the map is made; by default the root of the tf tree.
+        cloud_topic: Topic of the PointCloud2 messages; needed if there are several.
+        odometry_topic: Topic of Odometry messages, which replace tf for their child frame. By
+            default odometry is used if there is one topic and tf contains no motion.
+        world_frame: Frame of the map; by default the root of the tf tree.
 
     Returns:
-        The clouds as a stream; one without transforms at its time is a bad frame. The bag stays
-        open as long as the stream lives.
+        The clouds as a stream. A cloud without transforms at its time is a bad frame. The bag
+        stays open for the lifetime of the stream.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The bag cannot be read, a topic is missing or not the only one, or nothing says
-            how the sensor moves.
+        ValueError: The bag cannot be read, a topic is missing or ambiguous, or the bag does not
+            contain the motion of the sensor.
         ModuleNotFoundError: rosbags is not installed.
     """
     try:
@@ -71,7 +71,7 @@ def rosbag_stream(
         ) from error
     path = Path(path)
     with parsing(path, "ROS bag"):
-        # Older ROS 2 bags do not hold their types; those that we read have not changed.
+        # Older ROS 2 bags do not contain their types; the types read here have not changed.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     closing = ExitStack()
@@ -81,7 +81,7 @@ def rosbag_stream(
         with parsing(path, "ROS bag"):
             times, transforms, odometry, first = _scan(reader, clouds)
         if first is None:
-            raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message")
+            raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message, expected clouds")
         edges = _edges(path, transforms)
         sensor = _name(first.header.frame_id)
         if odometry_topic is None and not _moves(edges, sensor) and len(odometry) == 1:
@@ -97,12 +97,12 @@ def rosbag_stream(
             if moved.keys().isdisjoint(path_up(edges, sensor)):
                 raise ValueError(
                     f"{path}: odometry topic {odometry_topic} moves {list(moved)}, expected one of "
-                    f"{path_up(edges, sensor)}, the frames from the clouds' upwards"
+                    f"{path_up(edges, sensor)}, the frames from the cloud's frame upwards"
                 )
         above = path_up(edges, sensor, world_frame)
         if world_frame is None and not _moves(edges, sensor):
             raise ValueError(
-                f"{path}: nothing moves above the clouds' frame, {' in '.join(above)}; expected "
+                f"{path}: nothing moves above the cloud's frame, {' in '.join(above)}; expected "
                 f"tf, or one of the odometry topics {sorted(odometry)} whose child is one of these "
                 "frames, or a world_frame if the sensor stands still"
             )
@@ -124,16 +124,16 @@ def rosbag_stream(
 
 
 def cloud_of(message: Any) -> np.ndarray:
-    """Takes the points out of a PointCloud2.
+    """Converts a PointCloud2 message.
 
     Args:
-        message: With x, y and z among its fields, of any number type.
+        message: The message, with fields x, y and z of any number type.
 
     Returns:
         (height * width, 3) float32.
 
     Raises:
-        ValueError: A field is missing, or the data are too short.
+        ValueError: A field is missing, or there is too little data.
     """
     fields = {field.name: field for field in message.fields}
     missing = [name for name in "xyz" if name not in fields]
@@ -163,7 +163,7 @@ def cloud_of(message: Any) -> np.ndarray:
 
 
 def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection]:
-    """The connections of the topic with the clouds."""
+    """Returns the connections of the topic with the clouds."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype == _CLOUD})
     if topic is None and len(topics) == 1:
         topic = topics[0]
@@ -175,11 +175,11 @@ def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection
 def _scan(
     reader: AnyReader, clouds: list[Connection]
 ) -> tuple[list[tuple[int, int]], list[tuple[str, str, bool, _Row]], dict[str, list], Any]:
-    """Goes once through a bag, one message at a time.
+    """Reads a bag once, one message at a time.
 
     Returns:
-        When each cloud was recorded, ns, and which one of that time it is; the transforms of tf
-        and those of each odometry topic; the first cloud's message.
+        For each cloud the time of recording, ns, and its rank among the clouds of that time; the
+        transforms of tf; the transforms of each odometry topic; the first cloud's message.
     """
     wanted = [c for c in reader.connections if c.msgtype in (*_TRANSFORMS, _ODOMETRY)]
     times: list[tuple[int, int]] = []
@@ -209,7 +209,7 @@ def _scan(
 
 
 def _edges(path: Path, transforms: Iterable[tuple[str, str, bool, _Row]]) -> dict[str, Edge]:
-    """Sorts transforms into one trajectory a child frame; what moves counts, not what is fixed."""
+    """Groups transforms by child frame; motion takes precedence over a fixed transform."""
     rows: dict[tuple[str, bool], list[_Row]] = defaultdict(list)
     parents: dict[tuple[str, bool], str] = {}
     for child, parent, fixed, row in transforms:
@@ -221,7 +221,7 @@ def _edges(path: Path, transforms: Iterable[tuple[str, str, bool, _Row]]) -> dic
     for (child, fixed), parent in sorted(parents.items(), key=lambda item: not item[0][1]):
         table = rows[child, fixed]
         table = table[-1:] if fixed else sorted(table, key=lambda row: row[0])
-        motion = Trajectory(
+        motion = TimedPoses(
             stamps=np.array([stamp for stamp, _, _ in table]),
             positions=np.array([(p.x, p.y, p.z) for _, p, _ in table]),
             quaternions=np.array([(q.x, q.y, q.z, q.w) for _, _, q in table]),
@@ -236,7 +236,7 @@ def _moves(edges: dict[str, Edge], frame: str) -> bool:
 
 
 def _name(frame: str) -> str:
-    return frame.lstrip("/")  # tf of old wrote it so
+    return frame.lstrip("/")  # old tf wrote names with a leading slash
 
 
 def _seconds(stamp: Any) -> float:

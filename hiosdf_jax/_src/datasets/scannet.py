@@ -1,7 +1,7 @@
-"""Frames of a ScanNet scene, as its SensReader exports them.
+"""Frames of a ScanNet scene, as exported by its SensReader.
 
-- `depth/N.png`: 16 bits, millimetres along the optical axis; x right, y down, z forward.
-- `pose/N.txt`: 4 lines of 4 numbers, T_world_camera; -inf where the tracking was lost.
+- `depth/N.png`: 16 bits, mm along the optical axis; x right, y down, z forward.
+- `pose/N.txt`: 4 lines of 4 numbers, T_world_camera; -inf where tracking was lost.
 - `intrinsic/intrinsic_depth.txt`: 4 lines of 4 numbers, K in the upper left.
 """
 
@@ -14,24 +14,25 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
-from hiosdf_jax._src.datasets.poses import check_pose
 from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
-_SCALE = 1000.0  # depth is in millimetres
+_SCALE = 1000.0  # depth is in mm
 
 
 def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
     """Opens the exported frames of a ScanNet scene.
 
     Args:
-        folder: With `depth`, `pose` and `intrinsic`.
+        folder: The folder with `depth`, `pose` and `intrinsic`.
 
     Returns:
-        The depth images as a stream; one without a pose, or with ScanNet's -inf, is a bad frame.
+        The depth images as a stream. An image without a pose, or with ScanNet's -inf, is a bad
+        frame.
 
     Raises:
         FileNotFoundError: A file or folder is missing.
-        ValueError: A file is not what it should be; the message names it and the line.
+        ValueError: A file is malformed; the message names it and the line.
     """
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")

@@ -1,4 +1,4 @@
-"""What a dataset is to the rest of the code: a length, and items of (cloud, pose)."""
+"""The protocol that every dataset reader implements: a length, and items (cloud, pose)."""
 
 from __future__ import annotations
 
@@ -8,19 +8,29 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.poses import check_pose
+from hiosdf_jax._src.numerics.posed_cloud import check_pose, finite_rows
 
 _POINTS_PER_FRAME = 5000  # drawn from each cloud
-# A return counts where it is not alone: mirrors, glass and dust make lone ones, far out.
-# Percentiles alone would cut off a room that was only glanced at through a door, counts alone the
-# far walls of a short stream, so that either may vouch for a return.
+# Mirrors, glass and dust make single returns far outside. Percentiles alone would cut off a room
+# that was only glanced at through a door, and counts alone the far walls of a short stream.
+# A return therefore counts if either test accepts it.
 _CELL = 0.5  # m
 _MIN_POINTS_PER_CELL = 10
 _PERCENTILES = (0.1, 99.9)
 
 
 class Stream(Protocol):
-    """A posed sequence of clouds, converted one frame at a time."""
+    """A sequence of posed clouds, converted one frame at a time.
+
+    Any class with these two methods is a stream:
+
+        class Recording:
+            def __len__(self):
+                return len(self.files)
+
+            def __getitem__(self, index):
+                return np.load(self.files[index]), self.poses[index]
+    """
 
     def __len__(self) -> int:
         """The number of frames."""
@@ -33,7 +43,7 @@ class Stream(Protocol):
             index: 0 <= index < len(self).
 
         Returns:
-            cloud: (N, 3) float32, metres, sensor frame; a non-finite row is no return.
+            cloud: (N, 3) float32, m, sensor frame; a row with a NaN or inf is no return.
             pose: (4, 4) float32, T_world_sensor.
 
         Raises:
@@ -45,11 +55,15 @@ class Stream(Protocol):
 
 
 class BadFrameError(ValueError):
-    """A frame of a stream cannot be used; the message names it and tells why."""
+    """A frame of a stream cannot be used; the message names the frame and the reason."""
 
 
 class FrameStream:
-    """A `Stream` that reads each frame when it is asked for."""
+    """A `Stream` that reads each frame on demand.
+
+    Example:
+        first_frames = FrameStream("drive", 20, stream.__getitem__)
+    """
 
     def __init__(
         self,
@@ -57,12 +71,12 @@ class FrameStream:
         count: int,
         read: Callable[[int], tuple[np.ndarray, np.ndarray]],
     ) -> None:
-        """Makes a stream of a function.
+        """Makes a stream from a function.
 
         Args:
             path: Where the frames are, for messages.
-            count: How many frames there are.
-            read: Takes 0 <= index < count to a cloud (N, 3) and a pose (4, 4), as `Stream` does,
+            count: Number of frames.
+            read: Maps 0 <= index < count to a cloud (N, 3) and a pose (4, 4), as in `Stream` but
                 of any float type.
         """
         self.path = path
@@ -79,7 +93,7 @@ class FrameStream:
             index: -len(self) <= index < len(self).
 
         Returns:
-            cloud: (N, 3) float32, metres, sensor frame; a non-finite row is no return.
+            cloud: (N, 3) float32, m, sensor frame; a row with a NaN or inf is no return.
             pose: (4, 4) float32, T_world_sensor.
 
         Raises:
@@ -90,24 +104,24 @@ class FrameStream:
         index = frame_index(index, self._count, self.path)
         try:
             cloud, pose = self._read(index)
-        except OSError as error:  # a frame's own file: that frame is bad, not the stream
+        except OSError as error:  # the file of this frame: the frame is bad, not the stream
             raise ValueError(f"{error.filename}: {error.strerror}") from error
         return cloud.astype(np.float32, copy=False), pose.astype(np.float32)
 
 
 def frame_index(index: int, count: int, path: str | os.PathLike[str]) -> int:
-    """Resolves the index of a frame as a sequence does.
+    """Resolves the index of a frame as Python sequences do.
 
     Args:
         index: From the start, or negative from the end.
-        count: How many frames there are.
+        count: Number of frames.
         path: Where the frames are, for the message.
 
     Returns:
         0 <= index < count.
 
     Raises:
-        IndexError: Index is out of range; also what ends a plain `for cloud, pose in stream`.
+        IndexError: Index is out of range. It also ends a plain `for cloud, pose in stream`.
     """
     if not -count <= index < count:
         raise IndexError(f"{path}: frame {index}, expected one of {count} frames")
@@ -115,37 +129,33 @@ def frame_index(index: int, count: int, path: str | os.PathLike[str]) -> int:
 
 
 def read_frame(stream: Stream, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Reads a frame that a map can use.
+    """Reads a frame and checks that a map can use it.
 
     Args:
         stream: The frames.
         index: 0 <= index < len(stream).
 
     Returns:
-        The cloud and the pose, as of `Stream`; the cloud has a return and the pose is rigid.
+        The cloud and the pose, as from `Stream`. The cloud has a return and the pose is rigid.
 
     Raises:
-        BadFrameError: The frame cannot be read, or it is not so.
+        BadFrameError: The frame cannot be read, has no return, or has a pose that is not rigid.
     """
     try:
         cloud, pose = stream[index]
-        check_pose(pose, f"frame {index}")
-        if not np.isfinite(cloud).all(axis=-1).any():
-            raise ValueError(
-                f"cloud has no finite row among its {len(cloud)}, expected at least one return"
-            )
+        check_pose(pose)
+        finite_rows(cloud)
     except ValueError as error:
-        message = " ".join(str(error).removeprefix(f"frame {index}: ").split())
-        raise BadFrameError(f"frame {index}: {message}") from error
+        raise BadFrameError(f"frame {index}: {' '.join(str(error).split())}") from error
     return cloud, pose
 
 
 class Extent(NamedTuple):
-    """What one pass over a stream tells about it.
+    """The box that a stream covers and the range of its sensor.
 
     Attributes:
-        bounds: ((x0, y0, z0), (x1, y1, z1)) metres, world; the form that `Config` takes.
-        max_range: metres; nearly every return (99.9 %) is nearer to the sensor than this.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame, as `Config` takes it.
+        max_range: m; 99.9 % of the returns are closer to the sensor than this.
     """
 
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -153,23 +163,23 @@ class Extent(NamedTuple):
 
 
 def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = False) -> Extent:
-    """Finds the box that a stream sees, in one pass over it with a progress bar.
+    """Finds the box that a stream covers, in one pass with a progress bar.
 
-    Stray returns do not blow the box up: on each side the outermost returns, up to 0.1 % of all,
-    are left out unless they have company (10 sampled returns in half a metre). The path of the
-    sensor is always inside.
+    Stray returns do not enlarge the box: on each side the outermost returns, up to 0.1 % of all,
+    are left out unless 10 sampled returns share their cell of 0.5 m. The path of the sensor is
+    always inside.
 
     Args:
         stream: The frames.
-        margin: Metres added on every side.
-        skip_bad_frames: Pass over frames that cannot be read, have no return, or have a pose that
-            is not rigid.
+        margin: m, added on every side.
+        skip_bad_frames: Skip frames that cannot be read, have no return, or have a pose that is
+            not rigid.
 
     Returns:
-        The bounds, in the world, and the range of the sensor.
+        The bounds, in the world frame, and the range of the sensor.
 
     Raises:
-        BadFrameError: A frame is bad, and bad frames are not to be passed over.
+        BadFrameError: A frame is bad and `skip_bad_frames` is False.
         ValueError: Margin is negative, or no frame is usable.
     """
     from tqdm import tqdm
@@ -191,10 +201,10 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
         ranges.append(np.linalg.norm(cloud, axis=-1))
         path.append(pose[:3, 3])
     if not points:
-        raise ValueError(f"none of the {len(stream)} frames can be used")
+        raise ValueError(f"none of the {len(stream)} frames can be used, expected at least one")
     points = np.concatenate(points)
     corners = np.concatenate(
-        [np.percentile(points, _PERCENTILES, axis=0), points[_has_company(points)], path]
+        [np.percentile(points, _PERCENTILES, axis=0), points[_in_crowded_cells(points)], path]
     )
     lower, upper = corners.min(axis=0) - margin, corners.max(axis=0) + margin
     (x0, y0, z0), (x1, y1, z1) = lower.tolist(), upper.tolist()
@@ -204,11 +214,12 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
     )
 
 
-def _has_company(points: np.ndarray) -> np.ndarray:
-    """Tells for each of (N, 3) points whether its cell holds enough of them; (N,) bool."""
+def _in_crowded_cells(points: np.ndarray) -> np.ndarray:
+    """Returns a mask, (N,) bool, of the (N, 3) points whose cell holds enough of them."""
     key = np.zeros(len(points), np.int64)
     for coordinate in np.floor(points / _CELL).T:
-        # Ranks of the cells in use, not their indices: a return 1e9 m away cannot overflow the key.
+        # Ranks of the occupied cells instead of their indices: a return 1e9 m away cannot
+        # overflow the key.
         cells, rank = np.unique(coordinate, return_inverse=True)
         key = key * len(cells) + rank
     _, cell_of_point, count = np.unique(key, return_inverse=True, return_counts=True)

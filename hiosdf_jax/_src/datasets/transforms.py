@@ -1,4 +1,4 @@
-"""A tree of frames whose edges move, as ROS's tf has it."""
+"""A tree of coordinate frames whose edges move, like ROS's tf."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.trajectory import Trajectory, pose_at
+from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at
 
-_MAX_GAP = 1.0  # s; corrections of a map's frame may come that seldom
+_MAX_GAP = 1.0  # s; a localization may correct the map frame this rarely
 
 
 class Edge(NamedTuple):
-    """How a frame lies in its parent's.
+    """The pose of a frame in its parent.
 
     Attributes:
-        parent: The parent frame's name.
-        motion: T_parent_child over time; one pose if it is fixed.
-        fixed: The pose holds for all times.
+        parent: Name of the parent frame.
+        motion: T_parent_child over time; a single pose if the edge is fixed.
+        fixed: The pose holds at all times.
     """
 
     parent: str
-    motion: Trajectory
+    motion: TimedPoses
     fixed: bool
 
 
@@ -29,24 +29,24 @@ def path_up(edges: dict[str, Edge], frame: str, top: str | None = None) -> list[
     """Lists the frames from one up to the root of its tree.
 
     Args:
-        edges: By the child's name.
-        frame: Where to begin.
-        top: Where to end; by default at the root.
+        edges: The edge above each frame, by the frame's name.
+        frame: Where to start.
+        top: Where to stop; by default the root.
 
     Returns:
         Names, `frame` first, the top last.
 
     Raises:
-        ValueError: Top is not above the frame, or the frames go round in a circle.
+        ValueError: Top is not above the frame, or the frames form a cycle.
     """
     path = [frame]
     while path[-1] != top and path[-1] in edges:
         parent = edges[path[-1]].parent
         if parent in path:
-            raise ValueError(f"frames go round in a circle: {[*path, parent]}")
+            raise ValueError(f"frames form a cycle: {[*path, parent]}, expected a tree")
         path.append(parent)
     if top is not None and path[-1] != top:
-        raise ValueError(f"frame {top!r} is not above {frame!r}, which has above it: {path[1:]}")
+        raise ValueError(f"frame {top!r} is not above {frame!r}, expected one of {path[1:]}")
     return path
 
 
@@ -54,7 +54,7 @@ def transform_up(edges: dict[str, Edge], path: list[str], stamp: float) -> np.nd
     """Composes the transforms along a path at one time.
 
     Args:
-        edges: By the child's name.
+        edges: The edge above each frame, by the frame's name.
         path: From `path_up`.
         stamp: s.
 
@@ -62,7 +62,7 @@ def transform_up(edges: dict[str, Edge], path: list[str], stamp: float) -> np.nd
         (4, 4) float64, T_top_frame.
 
     Raises:
-        ValueError: There is no transform for this time.
+        ValueError: A moving edge has no pose for this time.
     """
     pose = np.eye(4)
     for child in path[:-1]:

@@ -1,12 +1,11 @@
 """Sequences of the TUM RGB-D benchmark, and others in its layout.
 
 - `depth.txt`: `timestamp filename` on each line.
-- the images: PNG of 16 bits, metres = value / 5000 along the optical axis; x right, y down,
-  z forward.
-- `groundtruth.txt`: `timestamp tx ty tz qx qy qz qw`, T_world_camera, seconds and metres.
+- the images: 16-bit PNG, m = value / 5000 along the optical axis; x right, y down, z forward.
+- `groundtruth.txt`: `timestamp tx ty tz qx qy qz qw`, T_world_camera, s and m.
 
-Poses are interpolated at the time of the image. The lens's distortion stays as it is: the depth is
-registered to the colour image, and its authors advise against undoing it.
+Poses are interpolated at the time of the image. Lens distortion is not corrected: the depth is
+registered to the color image, and the authors of the benchmark advise against it.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ import numpy as np
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import read_words
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.datasets.trajectory import pose_at, read_trajectory
+from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
 
 _SCALE = 5000.0
-_MAX_GAP = 0.2  # s; the motion capture gives 100 poses a second, where it sees the camera
+_MAX_GAP = 0.2  # s; motion capture gives 100 poses per second while it sees the camera
 _SIZE = (640, 480)
-# fx, fy, cx, cy of the colour cameras, to which the depth is registered, from the benchmark's site.
+# fx, fy, cx, cy of the color cameras, to which the depth is registered; from the benchmark's site.
 _FREIBURG = {
     "1": (517.3, 516.5, 318.6, 255.3),
     "2": (520.9, 521.0, 325.1, 249.7),
@@ -40,17 +39,17 @@ def tum_stream(
     """Opens a sequence in the layout of the TUM RGB-D benchmark.
 
     Args:
-        folder: With `depth.txt` and `groundtruth.txt`.
+        folder: The folder with `depth.txt` and `groundtruth.txt`.
         intrinsics: fx, fy, cx, cy in pixels; by default those of the benchmark's camera that the
-            folder's name tells (freiburg1, 2 or 3).
+            folder is named after (freiburg1, 2 or 3).
 
     Returns:
-        The depth images as a stream; one at a time without a pose is a bad frame.
+        The depth images as a stream. An image without a pose at its time is a bad frame.
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: A file is not what it should be, with its name and the line; or the camera is
-            not known.
+        ValueError: A file is malformed, and the message names it and the line; or the camera is
+            unknown.
     """
     folder = Path(folder)
     images = []
@@ -60,22 +59,22 @@ def tum_stream(
         except ValueError as error:
             raise ValueError(f"{folder / 'depth.txt'}, line {line}: {error}") from error
     if not images:
-        raise ValueError(f"{folder / 'depth.txt'}: no image in it")
-    trajectory = read_trajectory(folder / "groundtruth.txt")
+        raise ValueError(f"{folder / 'depth.txt'}: has no image, expected at least one")
+    poses = read_timed_poses(folder / "groundtruth.txt")
     size = None
     if intrinsics is None:
         found = re.search(r"(?:freiburg|fr)([123])(?!\d)", folder.absolute().name)
         if not found:
             raise ValueError(
-                f"{folder}: intrinsics are not known, expected them to be given or a folder named "
-                "after freiburg1, freiburg2 or freiburg3"
+                f"{folder}: unknown camera, expected intrinsics or a folder named after "
+                "freiburg1, freiburg2 or freiburg3"
             )
         intrinsics, size = _FREIBURG[found[1]], _SIZE
     matrix = pinhole(intrinsics, folder)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         stamp, image = images[index]
-        pose = pose_at(trajectory, stamp, _MAX_GAP)
+        pose = pose_at(poses, stamp, _MAX_GAP)
         return read_depth(image, _SCALE, matrix, size), pose
 
     return FrameStream(folder, len(images), frame)

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from hiosdf_jax._src.datasets.truth import GroundTruth, choose_thin
 from hiosdf_jax._src.demo.camera import DepthCamera
 from hiosdf_jax._src.demo.primitives import signed_distance
-from hiosdf_jax._src.scoring.metrics import GroundTruth, choose_thin
 
 # The rooms span (0, 0, 0) to (10, 8, 2.6) m and the walls are 0.15 m thick.
 BOUNDS_WORLD = ((-0.2, -0.2, -0.2), (10.2, 8.2, 2.8))  # m

@@ -12,6 +12,8 @@ then only an upper bound of the negative distance: |value| <= |exact|, with the 
 import mujoco
 import numpy as np
 
+from hiosdf_jax._src.numerics.chunks import fill_in_chunks
+
 # Points a pass: keeps the temporaries of one geom at a few megabytes.
 _CHUNK = 32768
 
@@ -55,9 +57,12 @@ def signed_distance(
     rotations = data.geom_xmat.reshape(-1, 3, 3)
 
     sdf, grad = np.empty(len(points)), np.empty((len(points), 3))
-    for start in range(0, len(points), _CHUNK):
-        chunk = slice(start, start + _CHUNK)
-        sdf[chunk], grad[chunk] = _union(model, data.geom_xpos, rotations, points[chunk])
+    fill_in_chunks(
+        lambda rows: _union(model, data.geom_xpos, rotations, points[rows]),
+        {"sdf": sdf, "grad": grad},
+        _CHUNK,
+        pad=False,
+    )
     return sdf, grad
 
 

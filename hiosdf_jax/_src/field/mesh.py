@@ -11,6 +11,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.lattice import check_resolution, sample_counts
 from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.state import Field, MapState
 
 if TYPE_CHECKING:
@@ -43,12 +44,12 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     shape = sample_counts(high - low, resolution)
     count = math.prod(shape)
     sdf, observed = np.empty(count, np.float32), np.empty(count, bool)
-    for start in range(0, count, _CHUNK):
-        # The last sample is repeated to fill the last chunk.
-        index = np.minimum(np.arange(start, start + _CHUNK), count - 1)
+
+    def sample(index: np.ndarray) -> tuple[jax.Array, jax.Array]:
         points_world = low + resolution * np.stack(np.unravel_index(index, shape), axis=-1)
-        values, seen = _sample(field, points_world.astype(np.float32))
-        sdf[index], observed[index] = np.asarray(values), np.asarray(seen)
+        return _sample(field, points_world.astype(np.float32))
+
+    fill_in_chunks(sample, {"sdf": sdf, "observed": observed}, _CHUNK)
     # Passes stop before the end of a ray, so up to about a voxel of unknown space lies between
     # observed free space and the surface.
     reach = max(1, math.ceil(field.config.voxel_size / resolution - 1e-6))

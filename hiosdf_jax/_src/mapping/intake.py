@@ -7,25 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hiosdf_jax._src.numerics.rigid import is_rigid
+from hiosdf_jax._src.numerics.posed_cloud import check_pose, finite_rows
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
-
-
-def check_shapes(cloud: Any, pose: Any) -> None:
-    """Checks shapes, of tracers as well.
-
-    Args:
-        cloud: (N, 3).
-        pose: (4, 4).
-
-    Raises:
-        ValueError: A shape is wrong.
-    """
-    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
-        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
-    if np.shape(pose) != (4, 4):
-        raise ValueError(f"pose has shape {np.shape(pose)}, expected (4, 4)")
 
 
 def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,19 +25,11 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         The cloud (capacity, 3) and the pose, float32.
 
     Raises:
-        ValueError: The pose is not finite or not rigid, or the cloud has no finite row.
+        ValueError: A shape is wrong, the pose is not finite or not rigid, or the cloud has no
+            finite row.
     """
-    cloud, pose = np.asarray(cloud, np.float32), np.asarray(pose, np.float32)
-    if not np.isfinite(pose).all():
-        raise ValueError(f"pose has values that are not finite, expected T_world_sensor: {pose}")
-    if not is_rigid(pose, np):
-        raise ValueError(f"pose is not rigid, expected a rotation and a translation: {pose}")
-    x, y, z = cloud.T  # column by column: many times faster than all(axis=1)
-    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
-    if not finite.any():
-        raise ValueError(
-            f"cloud has no finite row among its {len(cloud)}, expected at least one return"
-        )
+    cloud, pose = np.asarray(cloud, np.float32), check_pose(pose)
+    finite = finite_rows(cloud)
     padded = np.empty((capacity, 3), np.float32)
     count = len(cloud)
     if count <= capacity:

@@ -16,6 +16,7 @@ from hiosdf_jax._src.mapping import intake
 from hiosdf_jax._src.mapping.calibration import initial_optimism
 from hiosdf_jax._src.mapping.stages import begin, run_stages
 from hiosdf_jax._src.network.training import init_network
+from hiosdf_jax._src.numerics.posed_cloud import check_shapes
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.state import Field, Flag, MapState, Report, field_of
 
@@ -94,9 +95,9 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
-    intake.check_shapes(cloud, pose)
     leaves = (*jax.tree.leaves(state), cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        check_shapes(cloud, pose)
         return _update(state, jnp.asarray(cloud), jnp.asarray(pose))
     compiled = _update_donating if donate else _update_jit
     return compiled(state, *intake.prepare(cloud, pose, state.config.max_points))

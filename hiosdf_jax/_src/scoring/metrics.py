@@ -1,26 +1,27 @@
-"""Scores of a map against exact distances, and of any map against a table of peers.
+"""Scores of a map against exact distances, or against returns that it was not given.
 
-Everything here runs on the host and asks the map only through a callable, so that the same code
-scores our map, a baked field, a plain grid or somebody else's method.
+Everything here runs on the host and queries the map through a callable. The same code therefore
+scores a map, a baked field, a plain grid or another method.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from hiosdf_jax._src.datasets.truth import GroundTruth
+from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 
 # One batch shape for every call: a jitted map compiles once. Small enough that the activations of
 # a wide network stay in tens of megabytes on a CPU, large enough to keep a GPU busy.
 _CHUNK = 8192
 _NEAR = 0.5  # m, "near" in near_cm and near_bias_cm
 _LOCAL_RADIUS = 3.0  # m, the paper's local SDF error
-_RADIUS_BOUNDS = (0.05, 0.4)  # m, robot spheres from a gripper's finger to a mobile base
-_KEPT = 0.02  # m, a point of a thin part whose sdf is more than this has been lost
-_THIN_RETURNS = 10  # that a thin part needs to count
-_THIN_POINTS = 50  # at most so many points of each part, so that a leg counts as much as a shelf
-_BANDS = {  # of the true distance, m: least (in the band), upper end (not in it)
+_RADIUS_BOUNDS = (0.05, 0.4)  # m, robot spheres from a gripper finger to a mobile base
+_KEPT = 0.02  # m, a thin part is lost where the sdf on it exceeds this
+_BANDS = {  # true distance, m: from (inclusive), to (exclusive)
     "0-5 cm": (0.0, 0.05),
     "5-20 cm": (0.05, 0.2),
     "20-50 cm": (0.2, 0.5),
@@ -29,7 +30,7 @@ _BANDS = {  # of the true distance, m: least (in the band), upper end (not in it
 
 
 class Metric(NamedTuple):
-    """What a score means.
+    """The meaning of a score.
 
     Attributes:
         label: In words.
@@ -65,36 +66,15 @@ _METRICS = {
 METRICS = {key: Metric(*meaning) for key, meaning in _METRICS.items()}
 
 
-class GroundTruth(NamedTuple):
-    """Exact distances of a scene, at points that a sensor saw to be free.
-
-    Attributes:
-        points_world: (N, 3) float32, metres; points on rays between the sensor and the surface.
-        sdf: (N,) float32, metres; exact distance to the nearest surface.
-        grad: (N, 3) float32; exact unit gradient of the distance, d(sdf)/d(point).
-        frame: (N,) int32; the frame in which the point was first sampled.
-        surface_points_world: (M, 3) float32, metres; exact surface points that the sensor saw.
-        thin_points_world: (K, 3) float32, metres; exact surface points that the sensor saw of parts
-            less than 5 cm thick; empty where nobody has told such parts from others.
-    """
-
-    points_world: np.ndarray
-    sdf: np.ndarray
-    grad: np.ndarray
-    frame: np.ndarray
-    surface_points_world: np.ndarray
-    thin_points_world: np.ndarray = np.empty((0, 3), np.float32)
-
-
 class _Answers(NamedTuple):
-    """A map's answers beside the truth, at the points that count."""
+    """The answers of a map beside the truth, at the selected points."""
 
     points_world: np.ndarray
     sdf_true: np.ndarray
     sdf_map: np.ndarray
     eikonal: np.ndarray  # | |grad| - 1 |
     cosine: np.ndarray  # 1 - cos(grad, true grad)
-    radius: np.ndarray  # m, of the sphere that stands at the point
+    radius: np.ndarray  # m, of the sphere centered on the point
     complete: bool  # no frame is left out
 
 
@@ -106,31 +86,41 @@ def evaluate(
 ) -> dict[str, float]:
     """Scores a map against exact distances (section V-B of the paper, and collision recall).
 
-    A map that answers NaN gets NaN scores: nothing is left out of a mean. A score with nothing to
-    average (no true collision, say) is NaN too.
+    Nothing is left out of a mean: a map that returns NaN gets NaN scores. A score with nothing to
+    average, such as recall without a true collision, is NaN too.
+
+    Example:
+        field = hio.snapshot(state)
+        truth = datasets.read_truth("house_depth.npz")
+        scores = scoring.evaluate(lambda points: hio.sdf_and_grad(field, points), truth)
+        print(scoring.format_table(scores))
 
     Args:
-        sdf_and_grad: Maps (n, 3) float32 points in the world, metres, to (n,) distances in metres
-            and (n, 3) gradients, as numpy or jax arrays. Always called with the same n.
+        sdf_and_grad: Maps (n, 3) float32 points, m, world frame, to (n,) distances, m, and (n, 3)
+            gradients, as numpy or jax arrays. Every call has the same n.
         truth: Exact distances; see `GroundTruth`.
-        sensor_position_world: (3,) metres; adds `within_3m_cm`, the paper's local SDF error.
-        last_frame: Only points first seen in frames <= last_frame count. Surface points carry no
-            frame, so `surface_cm` is NaN while later frames are left out.
+        sensor_position_world: (3,) m; adds `within_3m_cm`, the paper's local SDF error.
+        last_frame: Use only points that were first observed in frames <= last_frame. Surface points
+            carry no frame, so `surface_cm` is NaN if this leaves points out.
 
     Returns:
-        `visible_cm` mean absolute error; `near_cm` the same where the true distance is < 0.5 m;
-        `within_3m_cm` the same within 3 m of the sensor (only with `sensor_position_world`);
-        `bias_cm` mean of map - truth; `near_bias_cm` the same where the true distance is < 0.5 m;
-        `surface_cm` mean |sdf| on surface points; `eikonal` mean of
-        | |grad| - 1 |; `cosine` mean of 1 - cos(grad, true grad), 1 where a gradient is zero;
-        `recall` and `fpr` of "a sphere collides when the distance at its centre < its radius",
-        for spheres of 0.05 to 0.4 m radius (drawn from one fixed seed) centred on the points;
-        `thin_share` share of the points on thin parts where sdf <= 2 cm (only if truth has such
-        points and no frame is left out).
+        `visible_cm`: mean absolute error.
+        `near_cm`: the same where the true distance is < 0.5 m.
+        `within_3m_cm`: the same within 3 m of the sensor, if `sensor_position_world` is given.
+        `bias_cm`: mean of map - truth.
+        `near_bias_cm`: the same where the true distance is < 0.5 m.
+        `surface_cm`: mean |sdf| on surface points.
+        `eikonal`: mean of | |grad| - 1 |.
+        `cosine`: mean of 1 - cos(grad, true grad); 1 where a gradient is zero.
+        `recall`, `fpr`: recall and false-alarm rate of the test "a sphere collides if the distance
+            at its center < its radius". The spheres are centered on the points, with radii of 0.05
+            to 0.4 m from a fixed seed.
+        `thin_share`: share of the points on thin parts where sdf <= 2 cm, if truth has such points
+            and no point is left out.
 
     Raises:
         ValueError: Truth is misshapen, no point has frame <= last_frame, the sensor position is not
-            (3,), or the map's answers have the wrong shape.
+            (3,), or the map returned the wrong shape.
     """
     answers = _ask(sdf_and_grad, truth, last_frame)
     error = answers.sdf_map - answers.sdf_true
@@ -139,18 +129,19 @@ def evaluate(
     paper = _paper_metrics(answers, everywhere, sensor_position_world)
     collides = answers.sdf_true < answers.radius
     called = np.where(np.isnan(answers.sdf_map), np.nan, answers.sdf_map < answers.radius)
-    # Points on surfaces carry no frame.
-    surface = truth.surface_points_world if answers.complete else np.empty((0, 3))
     scores = paper | {
         "near_cm": 100 * _mean(np.abs(error[near])),
         "bias_cm": 100 * _mean(error),
         "near_bias_cm": 100 * _mean(error[near]),
-        "surface_cm": 100 * _mean(np.abs(_in_chunks(sdf_and_grad, surface)[0])),
         "recall": _mean(called[collides]),
         "fpr": _mean(called[~collides]),
+        "surface_cm": np.nan,  # surface points carry no frame
     }
+    if answers.complete:
+        surface = _in_chunks(lambda p: sdf_and_grad(p)[0], truth.surface_points_world)
+        scores["surface_cm"] = 100 * _mean(np.abs(surface))
     if answers.complete and len(truth.thin_points_world):
-        thin = _in_chunks(sdf_and_grad, truth.thin_points_world)[0]
+        thin = _in_chunks(lambda p: sdf_and_grad(p)[0], truth.thin_points_world)
         scores["thin_share"] = _mean(np.where(np.isnan(thin), np.nan, thin <= _KEPT))
     return {key: scores[key] for key in METRICS if key in scores}
 
@@ -161,21 +152,21 @@ def evaluate_bands(
     sensor_position_world: Any | None = None,
     last_frame: int | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Scores a map by the paper's four metrics, near surfaces and far from them apart.
+    """Scores a map by the paper's four metrics, separately for bands of the true distance.
 
     Args:
-        sdf_and_grad: As for `evaluate`.
-        truth: As for `evaluate`.
-        sensor_position_world: As for `evaluate`.
-        last_frame: As for `evaluate`.
+        sdf_and_grad: As in `evaluate`.
+        truth: As in `evaluate`.
+        sensor_position_world: As in `evaluate`.
+        last_frame: As in `evaluate`.
 
     Returns:
-        {band: scores}; the bands are of the true distance, "0-5 cm", "5-20 cm", "20-50 cm" and
-        ">50 cm" (the nearer end belongs to a band); the scores are `visible_cm`, `within_3m_cm`
-        (only with `sensor_position_world`), `eikonal` and `cosine`, as of `evaluate`.
+        {band: scores}. The bands are "0-5 cm", "5-20 cm", "20-50 cm" and ">50 cm" of true distance;
+        each includes its lower end. The scores are `visible_cm`, `within_3m_cm` (only with
+        `sensor_position_world`), `eikonal` and `cosine`, as in `evaluate`.
 
     Raises:
-        ValueError: As of `evaluate`.
+        ValueError: As in `evaluate`.
     """
     answers = _ask(sdf_and_grad, truth, last_frame)
     distance = np.abs(answers.sdf_true)
@@ -188,21 +179,20 @@ def evaluate_bands(
 def evaluate_lower(
     lower: Callable[[np.ndarray], Any], truth: GroundTruth, last_frame: int | None = None
 ) -> dict[str, float]:
-    """Scores the lower bounds of the distance that a map gives.
+    """Scores a map's lower bounds of the distance.
 
     Args:
-        lower: Maps (n, 3) float32 points in the world, metres, to (n,) bounds in metres. Always
-            called with the same n.
-        truth: Exact distances at points that the sensor saw.
-        last_frame: Only points that were first sampled up to this frame count; None for all.
+        lower: Maps (n, 3) float32 points, m, world frame, to (n,) bounds, m. Every call has the
+            same n.
+        truth: Exact distances.
+        last_frame: Use only points that were first observed in frames <= last_frame.
 
     Returns:
-        `lower_coverage`, the share of the points at which the true distance is not below the
-        bound; `lower_slack_cm`, the mean of what lies between them.
+        `lower_coverage`: share of the points where the bound does not exceed the true distance.
+        `lower_slack_cm`: mean of true distance - bound.
     """
     selected = np.full(len(truth.sdf), True) if last_frame is None else truth.frame <= last_frame
-    bound, _ = _in_chunks(lambda points: (lower(points), points), truth.points_world[selected])
-    slack = truth.sdf[selected].astype(float) - bound
+    slack = truth.sdf[selected].astype(float) - _in_chunks(lower, truth.points_world[selected])
     return {"lower_coverage": _mean(slack >= 0), "lower_slack_cm": 100 * _mean(slack)}
 
 
@@ -211,126 +201,29 @@ def held_out_surface(
 ) -> dict[str, float]:
     """Scores a map of a real stream on returns that it was not given.
 
-    The distance at a return is zero but for the sensor's noise, so that this needs no ground truth.
+    Apart from the noise of the sensor the distance at a return is zero, so this needs no ground
+    truth.
 
     Args:
-        sdf: Maps (n, 3) float32 points in the world, metres, to (n,) distances in metres. Always
-            called with the same n.
-        points_world: (N, 3) metres, returns of frames that the map has not seen.
+        sdf: Maps (n, 3) float32 points, m, world frame, to (n,) distances, m. Every call has the
+            same n.
+        points_world: (N, 3) m, returns of frames that the map was not given.
 
     Returns:
-        `median_cm`, `mean_cm` and `p90_cm` (90th percentile) of |sdf| in centimetres.
+        `median_cm`, `mean_cm` and `p90_cm` (90th percentile) of |sdf|.
 
     Raises:
-        ValueError: points_world is not (N, 3) with N > 0, or the map's answers are misshapen.
+        ValueError: points_world is not (N, 3) with N > 0, or the map returned the wrong shape.
     """
     points = np.asarray(points_world)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise ValueError(f"points_world has shape {points.shape}, expected (N, 3) with N > 0")
-    error_cm = 100 * np.abs(_in_chunks(lambda p: (sdf(p), p), points)[0])
+    error_cm = 100 * np.abs(_in_chunks(sdf, points))
     return {
         "median_cm": float(np.median(error_cm)),
         "mean_cm": _mean(error_cm),
         "p90_cm": float(np.percentile(error_cm, 90)),
     }
-
-
-def choose_thin(part: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Chooses among returns those that tell whether thin parts are in a map.
-
-    Args:
-        part: (R,) int, number of the thin part that each return is from; -1 for anything else.
-        rng: Source of randomness.
-
-    Returns:
-        (K,) indices of returns: up to 50 of each part that has at least 10.
-    """
-    order = np.argsort(part, kind="stable")
-    order = order[part[order] >= 0]
-    _, starts = np.unique(part[order], return_index=True)
-    chosen = [
-        rng.choice(rows, min(len(rows), _THIN_POINTS), replace=False)
-        for rows in np.split(order, starts[1:])
-        if len(rows) >= _THIN_RETURNS
-    ]
-    return np.concatenate([np.empty(0, int), *chosen])
-
-
-def format_table(
-    scores: Mapping[str, float], peers: Mapping[str, Mapping[str, Any]] | None = None
-) -> str:
-    """Lays scores out as a table for a terminal.
-
-    Args:
-        scores: What `evaluate` or `held_out_surface` returned.
-        peers: {name: {metric: value}}; a value may be a list (one a seed), of which the mean is
-            shown. Peers with none of these metrics are left out.
-
-    Returns:
-        The table, one metric a row with its unit and which direction is better, then ours, then the
-        peers. A dash stands for "no value".
-    """
-    rows = [key for key in METRICS if key in scores]
-    columns: dict[str, Mapping[str, Any]] = {"ours": scores}
-    columns |= {name: peer for name, peer in (peers or {}).items() if any(r in peer for r in rows)}
-    cells = [["metric", "unit", "better", *columns]]
-    for key in rows:
-        cells.append(
-            [*METRICS[key], *(format_score(key, each.get(key)) for each in columns.values())]
-        )
-    return lay_out(cells, text_columns=3)
-
-
-def format_bands(bands: Mapping[str, Mapping[str, float]]) -> str:
-    """Lays scores by band of the true distance out as a table for a terminal.
-
-    Args:
-        bands: What `evaluate_bands` returned.
-
-    Returns:
-        The table, one band a row, one metric a column.
-    """
-    keys = [key for key in METRICS if any(key in scores for scores in bands.values())]
-    cells = [["true distance", *keys]]
-    for band, scores in bands.items():
-        cells.append([band, *(format_score(key, scores.get(key)) for key in keys)])
-    return lay_out(cells, text_columns=1)
-
-
-def format_score(key: str, value: Any) -> str:
-    """Writes a score as in all tables.
-
-    Args:
-        key: One of `METRICS`.
-        value: The score, None, or several of which the mean is taken.
-
-    Returns:
-        Two decimals of centimetres, three of anything else; a dash for no value or NaN.
-    """
-    if value is None or not np.isfinite(np.mean(value)):
-        return "-"
-    return f"{np.mean(value):.{2 if METRICS[key].unit == 'cm' else 3}f}"
-
-
-def lay_out(cells: Sequence[Sequence[str]], text_columns: int) -> str:
-    """Aligns a table, with a line under its first row.
-
-    Args:
-        cells: Rows of the same length, the first of them the headings.
-        text_columns: The first so many columns are text, aligned left; the rest are numbers.
-
-    Returns:
-        The table, without a line break at its end.
-    """
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    lines = [
-        "  ".join(
-            cell.ljust(width) if i < text_columns else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    ]
-    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
 def _ask(
@@ -361,7 +254,12 @@ def _ask(
             f"expected last_frame >= {frame.min() if count else 0} and a truth with points"
         )
     points, grad_true = points[selected], grad_true[selected].astype(float)
-    sdf_map, grad_map = _in_chunks(sdf_and_grad, points)
+    sdf_map, grad_map = np.empty(len(points)), np.empty((len(points), 3))
+    fill_in_chunks(
+        lambda rows: sdf_and_grad(points[rows].astype(np.float32)),
+        {"sdf of the map": sdf_map, "grad of the map": grad_map},
+        _CHUNK,
+    )
     norm_map = np.linalg.norm(grad_map, axis=-1)
     norm_product = norm_map * np.linalg.norm(grad_true, axis=-1)
     cosine = np.sum(grad_map * grad_true, axis=-1) / np.where(norm_product == 0, 1, norm_product)
@@ -395,25 +293,15 @@ def _paper_metrics(
     return scores
 
 
-def _in_chunks(
-    sdf_and_grad: Callable[[np.ndarray], tuple[Any, Any]], points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Queries in chunks of one shape; returns float64 (N,) and (N, 3)."""
-    sdf, grad = np.empty(len(points)), np.empty((len(points), 3))
-    for start in range(0, len(points), _CHUNK):
-        chunk = points[start : start + _CHUNK].astype(np.float32)
-        n = len(chunk)
-        # The last point repeated: a padding that every map can answer.
-        values, grads = sdf_and_grad(np.pad(chunk, ((0, _CHUNK - n), (0, 0)), mode="edge"))
-        for name, array, shape in (("sdf", values, (_CHUNK,)), ("grad", grads, (_CHUNK, 3))):
-            if np.shape(array) != shape:
-                raise ValueError(
-                    f"the map answered {name} of shape {np.shape(array)} for {_CHUNK} points, "
-                    f"expected {shape}"
-                )
-        sdf[start : start + n] = np.asarray(values)[:n]
-        grad[start : start + n] = np.asarray(grads)[:n]
-    return sdf, grad
+def _in_chunks(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
+    """Evaluates a function of points, (N, 3) -> (N,) float64, in chunks of one shape."""
+    values = np.empty(len(points))
+    fill_in_chunks(
+        lambda rows: (function(points[rows].astype(np.float32)),),
+        {"sdf of the map": values},
+        _CHUNK,
+    )
+    return values
 
 
 def _mean(values: np.ndarray) -> float:

@@ -1,1 +1,1 @@
-"""Maps as pictures, drawn without a display."""
+"""Pictures of maps, drawn without a display."""

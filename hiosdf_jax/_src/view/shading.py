@@ -1,7 +1,7 @@
-"""Shaded pictures of meshes, by a small software rasteriser: no GL, no display.
+"""Shaded pictures of meshes, by a small software rasterizer without GL or display.
 
-Scan conversion is exact and vectorised over faces, so that a surface has no holes whatever the
-size of its triangles, and a million faces take seconds in numpy.
+Scan conversion is exact and vectorized over faces. A surface has no holes, whatever the size of its
+triangles, and a million faces take seconds in numpy.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from scipy.sparse.csgraph import connected_components
 if TYPE_CHECKING:
     import trimesh
 
-_SUPERSAMPLING = 2  # picture elements along each side of a pixel
-_ELEVATION = np.deg2rad(52)  # of the camera: high enough to see over the walls of a room
-_AZIMUTH = np.deg2rad(24)  # off the long side: a view square onto it shows no second wall
-_MARGIN = 0.03  # of the picture, left free on each side
-# These two bound what is needed besides the mesh and the picture.
+_SUPERSAMPLING = 2  # samples along each side of a pixel
+_ELEVATION = np.deg2rad(52)  # of the camera, high enough to look over the walls of a room
+_AZIMUTH = np.deg2rad(24)  # off the long side; a view square onto it shows no second wall
+_MARGIN = 0.03  # share of the picture that stays free on each side
+# These two bound the memory beyond the mesh and the picture.
 _FACES_PER_BATCH = 20_000
 _ROWS_PER_BAND = 64
 _AMBIENT = 0.2
-_LIGHT = np.array([-0.35, 0.7, 0.9])  # towards it: the picture's right, level to the viewer, up
-_PALETTE = np.array(  # by height, from low to high: pale, so that the shading carries the shape
+_LIGHT = np.array([-0.35, 0.7, 0.9])  # direction to it: right, level towards the viewer, up
+_PALETTE = np.array(  # by height, from low to high; pale, so that the shading shows the shape
     [[0.80, 0.86, 0.94], [0.99, 0.93, 0.82], [0.98, 0.76, 0.56], [0.86, 0.57, 0.53]]
 )
 
 
-# Pieces that lie above this share of the height, and have less than this share of the area.
+# Pieces of a rough ceiling lie above this share of the height and have less than this share of the
+# area.
 _HIGH, _SMALL = 0.6, 0.02
 
 
@@ -43,14 +44,17 @@ def save_shaded(
 ) -> None:
     """Draws a mesh from above at an angle, shaded and tinted by height, on white.
 
-    Faces that look away from the camera are left out: one looks through the ceiling and the near
-    walls of a mapped room into it. The long side of the mesh lies across the picture.
+    Faces that look away from the camera are left out, so the view passes through the ceiling and
+    the near walls into a mapped room. The long side of the mesh lies across the picture.
+
+    Example:
+        save_shaded("mesh.png", hio.extract_mesh(field))
 
     Args:
-        path: The picture, in a format that its ending names (.png).
-        mesh: Faces with their normals towards free space, metres.
+        path: The picture; its suffix names the format (.png).
+        mesh: Faces with normals towards free space, m.
         size: (width, height) in pixels.
-        up_world: (3,) the direction against gravity in the mesh's frame, of any length.
+        up_world: (3,) direction against gravity in the mesh's frame, of any length.
 
     Raises:
         ValueError: The mesh has no faces, size is not two positive numbers, or up_world is not a
@@ -70,7 +74,7 @@ def save_shaded(
 
 
 def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.ndarray:
-    """Renders; returns (height, width, 3) in 0..1."""
+    """Renders a mesh; returns (height, width, 3) in 0..1."""
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     camera = _camera_axes(vertices, up)
     width, height = (_SUPERSAMPLING * side for side in size)
@@ -85,7 +89,7 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     normal = normal[shown] / length[shown, None]
     corners = vertices[faces[shown]]  # (F, 3, 3)
 
-    view = corners @ camera.T  # metres along the picture's right, up and towards the viewer
+    view = corners @ camera.T  # m along the picture's right, up and towards the viewer
     lower, upper = view.min(axis=(0, 1)), view.max(axis=(0, 1))
     extent = upper - lower
     scale = (1 - 2 * _MARGIN) * min(width / extent[0], height / extent[1])  # pixels / m
@@ -93,11 +97,11 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     column = (view[..., 0] - middle[0]) * scale + (width - 1) / 2
     row = (middle[1] - view[..., 1]) * scale + (height - 1) / 2
     depth = (upper[2] - view[..., 2]) * scale  # >= 0, pixels, away from the viewer
-    face, depth = _rasterise(np.stack([column, row, depth], axis=-1), width, height)
+    face, depth = _rasterize(np.stack([column, row, depth], axis=-1), width, height)
     covered = face >= 0
 
     light = _LIGHT @ np.stack([camera[0], np.cross(camera[0], up), up])
-    # Lambert's cosine, wrapped round: a wall in the shade still shows its shape.
+    # Wrapped Lambert shading: a wall in the shade still shows its shape.
     cosine = normal @ light / np.linalg.norm(light)
     brightness = _AMBIENT + (1 - _AMBIENT) * (1 + cosine) / 2
     low, high = np.percentile(corners @ up, [1, 99])
@@ -107,7 +111,7 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     for top in range(0, size[1], _ROWS_PER_BAND):
         band = slice(_SUPERSAMPLING * top, _SUPERSAMPLING * (top + _ROWS_PER_BAND))
         inside = covered[band]
-        # Back from the picture to metres: the height of what each pixel shows.
+        # From pixels back to m: the height of the surface at each pixel.
         rows = np.nonzero(inside)[0] + band.start
         level = (middle[1] + ((height - 1) / 2 - rows) / scale) * (camera[1] @ up)
         level += (upper[2] - depth[band][inside] / scale) * (camera[2] @ up)
@@ -121,12 +125,12 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
 
 
 def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """Tells faces of small pieces that float near the top: a rough ceiling's that do not look away.
+    """Returns a mask of the faces of small pieces near the top, remains of a rough ceiling.
 
     Args:
         level: (V,) height of each vertex.
         faces: (F, 3) vertices of each face.
-        area: (F,) of each face, in any unit.
+        area: (F,) area of each face, in any unit.
 
     Returns:
         (F,) bool.
@@ -144,15 +148,15 @@ def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) 
 
 
 def _camera_axes(vertices: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Returns (3, 3), the rows of which point right, up and to the viewer of the picture."""
-    # Any two axes that are level will do to find the long side in.
+    """The camera's axes as rows, (3, 3): right, up and towards the viewer of the picture."""
+    # Any two level axes serve to find the long side.
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     level = np.stack([first, np.cross(up, first)])
     flat = (vertices - vertices.mean(axis=0)) @ level.T
     long_side = np.linalg.eigh(flat.T @ flat)[1][:, 1] @ level
-    # Of its two directions the one along the largest axis of the frame, so that pictures of one
-    # place taken again do not turn round.
+    # The sign follows the largest axis of the frame, so that later pictures of one place do not
+    # turn around.
     long_side *= np.sign(long_side[np.argmax(np.abs(long_side))])
     away = np.cross(up, long_side)
     right = np.cos(_AZIMUTH) * long_side + np.sin(_AZIMUTH) * away
@@ -161,19 +165,19 @@ def _camera_axes(vertices: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(viewer, right), viewer])
 
 
-def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+def _rasterize(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Finds the nearest face at each pixel.
 
     Args:
-        corners: (F, 3, 3); for each corner of each face its column, row and depth.
-        width: Columns; pixel centres are at integers.
-        height: Rows.
+        corners: (F, 3, 3), column, row and depth of each corner of each face.
+        width: Number of columns; pixel centers are at integers.
+        height: Number of rows.
 
     Returns:
-        face: (height, width) int, -1 where there is none.
-        depth: (height, width) its depth, inf where there is none.
+        face: (height, width) int, -1 for none.
+        depth: (height, width) depth of that face, inf for none.
     """
-    # Depth in the high bits and the face in the low ones: one minimum finds both.
+    # Depth in the high bits and the face in the low bits: one minimum finds both.
     nothing = np.iinfo(np.int64).max
     deepest = corners[..., 2].max(initial=1)
     steps = (2**31 - 2) / deepest
@@ -191,7 +195,7 @@ def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray
         which, row, column = _fragments(corners[part, :, :2])
         which += start
         depth = origin[which] + slope[which, 0] * column + slope[which, 1] * row
-        depth = np.clip(depth, near[which], far[which])  # a face on edge has any slope
+        depth = np.clip(depth, near[which], far[which])  # a face seen edge-on has any slope
         key = ((depth * steps).astype(np.int64) << 32) | which
         np.minimum.at(buffer, row * width + column, key)
     buffer = buffer.reshape(height, width)
@@ -203,20 +207,20 @@ def _rasterise(corners: np.ndarray, width: int, height: int) -> tuple[np.ndarray
 
 
 def _fragments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lists the pixels in faces: which face, its row and its column, (n,) each.
+    """Lists the pixels in faces: the face, the row and the column, (n,) each.
 
     Args:
-        corners: (F, 3, 2); for each corner of each face its column and row.
+        corners: (F, 3, 2), column and row of each corner of each face.
     """
-    slack = 1e-6  # pixels: neighbours round their common edge differently
+    slack = 1e-6  # pixels; neighbors round their common edge differently
     first = np.ceil(corners[..., 1].min(axis=1) - slack).astype(int)
     last = np.floor(corners[..., 1].max(axis=1) + slack).astype(int)
     face, row = _ranges(first, last)
-    # On each row a face covers what lies between its edges there.
+    # On each row a face covers the columns between its edges.
     left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for i in range(3):
         (x0, y0), (x1, y1) = corners[face, i].T, corners[face, (i + 1) % 3].T
-        level = y1 == y0  # the ends of a level edge belong to the two others
+        level = y1 == y0  # the ends of a level edge belong to the two other edges
         t = (row - y0) / np.where(level, 1, y1 - y0)
         crosses = ~level & (t >= -slack) & (t <= 1 + slack)
         x = x0 + t * (x1 - x0)
@@ -231,7 +235,7 @@ def _fragments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lists the integers from first[i] to last[i] for all i; returns i and the integer, (n,)."""
+    """Lists the integers from first[i] to last[i] for all i; returns each i and integer, (n,)."""
     count = np.maximum(last - first + 1, 0)
     which = np.repeat(np.arange(len(count)), count)
     before = np.cumsum(count) - count
@@ -239,7 +243,7 @@ def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _occlusion(depth: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Darkens what lies behind its surroundings, as a stand-in for ambient occlusion.
+    """Darkens pixels that lie behind their surroundings, as a stand-in for ambient occlusion.
 
     After Luft et al., Image enhancement by unsharp masking the depth buffer (SIGGRAPH 2006).
 

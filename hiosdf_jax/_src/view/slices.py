@@ -1,4 +1,4 @@
-"""Level slices of a map as a picture: what it says, what is true, and the difference."""
+"""Horizontal slices of a map as a picture: the map, the exact distance and the difference."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from hiosdf_jax._src.numerics.chunks import fill_in_chunks
+
 _COLUMNS = 400  # samples along the longer side of a slice
-_CHUNK = 16384  # points in each query: one shape, so that a jitted map compiles once
-_ERROR_CM = 10.0  # end of the colour scale of errors
+_CHUNK = 16384  # points per query; one shape, so that a jitted map compiles once
+_ERROR_CM = 10.0  # end of the color scale of errors
 _PANEL_INCHES = 5.0
-_SURFACE_REACH = 0.15  # m: surfaces lie at the edge of what was seen, or a voxel beyond
+_SURFACE_REACH = 0.15  # m; surfaces lie at the edge of observed space, or a voxel beyond
 
 
 def save_slices(
@@ -25,26 +27,33 @@ def save_slices(
     path_world: np.ndarray | None = None,
     observed: Callable[[np.ndarray], Any] | None = None,
 ) -> None:
-    """Draws slices of a map at constant z of the world, one row a height (as the paper's Fig. 4).
+    """Draws slices of a map at constant z, one row per height (as in Fig. 4 of the paper).
 
-    Each row shows the map and, with `truth_sdf`, the exact distance on the same colours and the
-    signed error. Surfaces are black lines; what was not observed is grey.
+    Each row shows the map and, with `truth_sdf`, the exact distance in the same colors and the
+    signed error. Surfaces are black lines; unobserved space is gray.
+
+    Example:
+        field = hio.snapshot(state)
+        bounds = field.config.bounds
+        save_slices("slices.png", lambda points: hio.sdf(field, points), None, bounds, [0.5, 1.2])
 
     Args:
-        path: The picture, in a format that its ending names.
-        sdf: Maps (n, 3) float32 points in the world, metres, to (n,) metres. Always called with the
-            same n, as are the other callables.
-        truth_sdf: The same, exact; None where there is no ground truth.
-        bounds: ((x0, y0, z0), (x1, y1, z1)) metres, world; z is not used.
-        heights: Z of each slice, metres, world.
-        path_world: (F, 3) metres, the path of the sensor, drawn on top.
+        path: The picture; its suffix names the format.
+        sdf: Maps (n, 3) float32 points, m, world frame, to (n,) distances, m. Every call has the
+            same n, for the other callables too.
+        truth_sdf: The exact distance; None if there is no ground truth.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; z is not used.
+        heights: z of each slice, m, world frame.
+        path_world: (F, 3) m, the path of the sensor, drawn on top.
         observed: Maps (n, 3) points to (n,) bool.
 
     Raises:
         ValueError: There are no heights, bounds is not (2, 3) with a positive size in x and y, or a
-            callable's answer is misshapen.
+            callable returned the wrong shape.
     """
-    from matplotlib.figure import Figure  # without pyplot: Agg, whatever the user's backend is
+    from matplotlib.figure import (
+        Figure,
+    )  # not pyplot: draws with Agg, whatever backend the user has
     from scipy.ndimage import maximum_filter
 
     box = np.asarray(bounds, float)
@@ -62,7 +71,7 @@ def save_slices(
             panels.append(100 * (panels[0] - panels[1]))
         seen = None if observed is None else _sample(observed, points, "observed") > 0.5
         rows.append((panels, seen))
-    # Where nothing was observed a map may say anything: that must not set the scale.
+    # In unobserved space a map may return anything, which must not set the scale.
     shown = [p[slice(None) if seen is None else seen] for ps, seen in rows for p in ps[:2]]
     shown = np.abs(np.concatenate([panel.ravel() for panel in shown]))
     limit = float(np.nanpercentile(shown, 99)) if shown.any() else 1.0
@@ -83,11 +92,11 @@ def save_slices(
             ax.imshow(panel, **image, **(error if i == 2 else distance))
             if seen is not None:
                 ax.imshow(np.where(seen, np.nan, 0.78), **image, cmap="gray", vmin=0, vmax=1)
-            surface = panels[min(i, 1)]  # the error's panel shows where the surfaces truly are
-            # A distance without a sign never crosses zero: a line close by has to do.
+            surface = panels[min(i, 1)]  # the error's panel shows the true surfaces
+            # An unsigned distance never crosses zero: a level close to it replaces zero.
             level = 0.0 if np.nanmin(surface) < 0 else x[1] - x[0]
             if i == 0 and seen is not None:
-                # Zeros far from all that was seen are the map's guesses, not surfaces.
+                # Zeros far from observed space are guesses of the map, not surfaces.
                 samples = math.ceil(_SURFACE_REACH / (x[1] - x[0]))
                 surface = np.where(maximum_filter(seen, 2 * samples + 1), surface, np.nan)
             finite = surface[np.isfinite(surface)]
@@ -116,7 +125,7 @@ def save_slices(
 
 
 def _axes(box: np.ndarray) -> list[np.ndarray]:
-    """Returns the centres of a grid of square cells over x and y."""
+    """The centers of a grid of square cells over x and y."""
     span = box[1, :2] - box[0, :2]
     counts = np.maximum(np.rint(_COLUMNS * span / span.max()), 2).astype(int)
     return [
@@ -126,16 +135,8 @@ def _axes(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _sample(function: Callable[[np.ndarray], Any], points: np.ndarray, name: str) -> np.ndarray:
-    """Evaluates a callable at (H, W, 3) points in chunks of one shape; returns (H, W) floats."""
+    """Evaluates a function at (H, W, 3) points in chunks of one shape; returns (H, W) floats."""
     flat = points.reshape(-1, 3).astype(np.float32)
     values = np.empty(len(flat))
-    for start in range(0, len(flat), _CHUNK):
-        chunk = flat[start : start + _CHUNK]
-        n = len(chunk)
-        answer = np.asarray(function(np.pad(chunk, ((0, _CHUNK - n), (0, 0)), mode="edge")))
-        if answer.shape != (_CHUNK,):
-            raise ValueError(
-                f"{name} answered shape {answer.shape} for {_CHUNK} points, expected ({_CHUNK},)"
-            )
-        values[start : start + n] = answer[:n]
+    fill_in_chunks(lambda rows: (function(flat[rows]),), {name: values}, _CHUNK)
     return values.reshape(points.shape[:2])

@@ -1,4 +1,4 @@
-"""How a finished map is turned and cut to be drawn; tests/test_cli.py looks at the pictures."""
+"""How a finished map is leveled and cut; test_command_map_stream.py checks the pictures."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,13 @@ import trimesh
 from hiosdf_jax._src.view import drawing
 
 
-def test_slice_heights():
+def test_heights_of_the_slices():
     assert drawing.slice_heights(1.2, 0.0, 2.6) == [0.6, 1.2]
     assert drawing.slice_heights(1.0, 0.0, 9.0) == [0.5, 1.0, 5.0]
     assert drawing.slice_heights(0.3, 0.0, 1.0) == [0.3]
 
 
-def test_level_up():
+def test_floors_give_the_direction_up():
     room = trimesh.creation.box([2.4, 2, 1.6])
     room.invert()  # free space is inside
     turn = trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])
@@ -24,16 +24,16 @@ def test_level_up():
     np.testing.assert_array_equal(drawing.level_up(trimesh.Trimesh(), up), up)
 
 
-def test_no_surface_leaves_no_old_mesh(tmp_path, capsys):
+def test_a_map_without_surface_removes_the_old_mesh(tmp_path, capsys):
     for name in ("mesh.ply", "mesh.png"):
-        (tmp_path / name).write_text("of an earlier run")
+        (tmp_path / name).write_text("from an earlier run")
     drawing._write_mesh(tmp_path, trimesh.Trimesh(), np.array([0.0, 0, 1]))
     assert not list(tmp_path.iterdir())
     assert "no surface" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0.6, 0, -0.8], [0, 0, -1]])
-def test_turn_to(up):
+def test_the_turn_maps_z_to_up(up):
     turn = drawing._turn_to(np.array(up, float))
     np.testing.assert_allclose(turn @ [0, 0, 1], up, atol=1e-12)
     np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Trajectories with time stamps, and poses between them."""
+"""Poses with time stamps, and the interpolation between them."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import read_rows
 
-_NEAR = 0.02  # s; a pose this near may stand in where there is none on both sides
+_NEAR = 0.02  # s; a pose this close to a stamp is used where there is nothing to interpolate
 _UNIT_TOLERANCE = 0.01  # on the length of a quaternion; real ones are written with few digits
 
 
 @dataclasses.dataclass(frozen=True)
-class Trajectory:
-    """Poses over time.
+class TimedPoses:
+    """Poses of one frame in its parent, over time.
 
     Attributes:
-        stamps: (F,) float64 s, never falling.
+        stamps: (F,) float64 s, never decreasing.
         positions: (F, 3) float64 m, in the parent frame.
         quaternions: (F, 4) float64, x y z w, of T_parent_child.
         source: Where the poses come from, for messages.
-        lines: (F,) line numbers, if it is a file.
+        lines: (F,) line numbers, if the source is a file.
     """
 
     stamps: np.ndarray
@@ -39,81 +39,81 @@ class Trajectory:
         return f"{self.source}, line {self.lines[index]}"
 
 
-def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
-    """Reads a trajectory in TUM's format: `timestamp tx ty tz qx qy qz qw` on each line.
+def read_timed_poses(path: str | os.PathLike[str]) -> TimedPoses:
+    """Reads poses in TUM's format: `timestamp tx ty tz qx qy qz qw` on each line.
 
     Args:
         path: The file.
 
     Returns:
-        The poses as they are in the file; whether they are usable is for `pose_at` to say.
+        The poses as they stand in the file; `pose_at` checks those that it uses.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: A line is malformed or earlier than the one before, or there is none.
+        ValueError: A line is malformed, a stamp is earlier than the one before it, or the file has
+            no pose.
     """
     rows, lines = read_rows(path, 8)
     if not len(rows):
-        raise ValueError(f"{path}: no pose in it")
+        raise ValueError(f"{path}: has no pose, expected at least one")
     early = np.flatnonzero(~(np.diff(rows[:, 0]) >= 0))
     if len(early):
         i = early[0] + 1
         raise ValueError(
             f"{path}, line {lines[i]}: time {rows[i, 0]:.6f} s after {rows[i - 1, 0]:.6f} s, "
-            "expected times that never fall"
+            "expected times that never decrease"
         )
-    return Trajectory(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
+    return TimedPoses(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
 
 
-def pose_at(trajectory: Trajectory, stamp: float, max_gap: float) -> np.ndarray:
-    """Interpolates a trajectory: linearly in position, along the great arc in rotation.
+def pose_at(poses: TimedPoses, stamp: float, max_gap: float) -> np.ndarray:
+    """Interpolates poses: positions linearly, rotations along the great arc.
 
     Args:
-        trajectory: The poses.
+        poses: The poses.
         stamp: s.
-        max_gap: s; between poses farther apart than this nothing is interpolated, but a pose
-            nearer than 0.02 s is taken as it is.
+        max_gap: s; poses farther apart than this are not interpolated. A pose within 0.02 s of the
+            stamp is used as it is.
 
     Returns:
         (4, 4) float64, T_parent_child.
 
     Raises:
-        ValueError: There is no pose for this time, or those there are are not finite or have no
-            unit quaternion; the message names the source, and the line if it is a file.
+        ValueError: No pose is close enough to the stamp, or the poses there are not finite or have
+            no unit quaternion. The message names the source, and the line if it is a file.
     """
     from scipy.spatial.transform import Rotation, Slerp
 
-    stamps = trajectory.stamps
+    stamps = poses.stamps
     after = int(np.searchsorted(stamps, stamp))
     around = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
     nearest = min(around, key=lambda i: abs(stamps[i] - stamp))
     if len(around) == 2 and stamps[nearest] != stamp and np.ptp(stamps[around]) <= max_gap:
-        positions, rotations = zip(*(_checked(trajectory, i) for i in around), strict=True)
+        positions, rotations = zip(*(_checked(poses, i) for i in around), strict=True)
         share = (stamp - stamps[around[0]]) / np.ptp(stamps[around])
         position = (1 - share) * positions[0] + share * positions[1]
         rotation = Slerp([0, 1], Rotation.concatenate(rotations))(share)
     elif abs(stamps[nearest] - stamp) <= _NEAR:
-        position, rotation = _checked(trajectory, nearest)
+        position, rotation = _checked(poses, nearest)
     else:
         raise ValueError(
-            f"{trajectory.source}: no pose for {stamp:.6f} s; the nearest is "
-            f"{abs(stamps[nearest] - stamp):.3f} s away, expected {_NEAR} s, or poses on both "
-            f"sides that are at most {max_gap} s apart"
+            f"{poses.source}: no pose for {stamp:.6f} s; the nearest is "
+            f"{abs(stamps[nearest] - stamp):.3f} s away, expected one within {_NEAR} s, or poses "
+            f"on both sides at most {max_gap} s apart"
         )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
     return pose
 
 
-def _checked(trajectory: Trajectory, index: int):  # noqa: ANN202, scipy is imported when used
+def _checked(poses: TimedPoses, index: int):  # noqa: ANN202, scipy is imported when used
+    """The position and the rotation of one pose."""
     from scipy.spatial.transform import Rotation
 
-    position, quaternion = trajectory.positions[index], trajectory.quaternions[index]
+    position, quaternion = poses.positions[index], poses.quaternions[index]
     if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
-        raise ValueError(f"{trajectory.place(index)}: pose has values that are not finite")
+        raise ValueError(f"{poses.place(index)}: pose has values that are not finite")
     length = np.linalg.norm(quaternion)
     if abs(length - 1) > _UNIT_TOLERANCE:
-        raise ValueError(
-            f"{trajectory.place(index)}: quaternion has length {length:.4g}, expected 1"
-        )
+        raise ValueError(f"{poses.place(index)}: quaternion has length {length:.4g}, expected 1")
     return position, Rotation.from_quat(quaternion)

@@ -1,4 +1,4 @@
-"""Clouds against the projection they invert."""
+"""Clouds of depth and range images against the projection that they invert."""
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ def test_no_return_is_a_row_of_nan(nothing):
     np.testing.assert_allclose(np.delete(cloud, 6, axis=0), [[0, 0.9, 1.2]] * 11, rtol=1e-6)
 
 
-def test_batches_and_jit_change_nothing():
+def test_batches_and_jit_give_the_same_clouds():
     depth = np.random.default_rng(0).uniform(0.1, 5, (2, 3, 4, 5)).astype(np.float32)
     batched = depth_to_cloud(depth, K)
     assert batched.shape == (2, 3, 20, 3)
@@ -65,13 +65,13 @@ def test_batches_and_jit_change_nothing():
     )
 
 
-def test_whole_numbers_are_metres_too():
+def test_integers_are_meters_too():
     cloud = depth_to_cloud(np.full((2, 2), 3, np.uint16), K)
     np.testing.assert_allclose(cloud[:, 2], 3.0)
     assert jnp.issubdtype(cloud.dtype, jnp.floating)
 
 
-def test_misuse_is_named():
+def test_messages_name_the_wrong_shape():
     with pytest.raises(ValueError, match=r"depth has shape \(5,\), expected \(\.\.\., H, W\)"):
         depth_to_cloud(np.ones(5), K)
     with pytest.raises(ValueError, match=r"intrinsics has shape \(4,\), expected \(3, 3\)"):

@@ -1,0 +1,151 @@
+"""Maps the frames of a stream one by one."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
+from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.scoring.held_out import draw_returns
+from hiosdf_jax._src.state import MapState
+
+
+class NothingMappedError(Exception):
+    """No frame of a stream could be mapped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mapped:
+    """The map of a stream, and how it was made.
+
+    Attributes:
+        state: The map after the last frame.
+        path_world: (F, 3) m, the sensor's positions in the mapped frames.
+        up_world: (3,) unit vector against gravity, estimated from the sensor's poses.
+        update_seconds: (F,) s, of each update until its result was ready.
+        last_frame: Index of the last mapped frame.
+        skipped: Number of bad frames that were skipped.
+        stopped: The bad frame that ended the mapping early, if any.
+        held_out_world: (M, 3) float32 m, returns of the frames that the map was not given.
+        points_used: Number of fused points, over all frames.
+        points_outside: Number of points in range but outside the bounds, over all frames.
+    """
+
+    state: MapState
+    path_world: np.ndarray
+    up_world: np.ndarray
+    update_seconds: np.ndarray
+    last_frame: int
+    skipped: int
+    stopped: BadFrameError | None
+    held_out_world: np.ndarray
+    points_used: int
+    points_outside: int
+
+
+def fuse_frames(
+    stream: Stream,
+    config: Config,
+    key: jax.Array,
+    *,
+    held_out: Sequence[int] = (),
+    skip_bad_frames: bool = False,
+) -> Mapped:
+    """Fuses the frames of a stream into a map, one by one, with a progress bar.
+
+    Args:
+        stream: The frames.
+        config: The map's configuration.
+        key: Source of the map's randomness.
+        held_out: Indices of frames that the map is not given; the result has returns of theirs.
+        skip_bad_frames: Report bad frames on stderr and continue. By default the first bad frame
+            ends the mapping.
+
+    Returns:
+        The map and how it was made.
+
+    Raises:
+        BadFrameError: A frame is bad and nothing was mapped before it.
+        NothingMappedError: No frame could be mapped.
+    """
+    from tqdm import tqdm
+
+    state = pipeline.init(config, key)
+    seconds, path_world, ups_world = [], [], []
+    kept_world, kept_rng = [np.empty((0, 3), np.float32)], np.random.default_rng(0)
+    points_used = points_outside = skipped = last_frame = 0
+    stopped = None
+    bar = tqdm(range(len(stream)), desc="mapping", unit="frame")
+    for i in bar:
+        try:
+            cloud, pose = read_frame(stream, i)
+        except BadFrameError as error:
+            if not skip_bad_frames:
+                stopped = error
+                break
+            skipped += 1
+            tqdm.write(str(error), file=sys.stderr)
+            continue
+        if i in held_out:
+            kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
+            continue
+        last_frame = i
+        path_world.append(pose[:3, 3])
+        ups_world.append(_up_of_frame(cloud, pose))
+        start = time.perf_counter()
+        state = jax.block_until_ready(pipeline.update(state, cloud, pose))
+        seconds.append(time.perf_counter() - start)
+        if len(seconds) == 1:
+            return_freed_memory()
+        points_used += int(state.report.points_used)
+        points_outside += int(state.report.points_outside)
+        if i % 5 == 0:
+            loss_cm = 100 * float(state.report.sdf_loss)
+            bar.set_postfix_str(
+                f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points", refresh=False
+            )
+    bar.close()
+    if not seconds:
+        raise stopped or NothingMappedError(
+            f"none of the {len(stream) - len(held_out)} frames could be mapped, "
+            "expected at least one"
+        )
+    up_world = np.mean(ups_world, axis=0)
+    length = np.linalg.norm(up_world)
+    return Mapped(
+        state=state,
+        path_world=np.asarray(path_world, float),
+        up_world=up_world / length if length > 0.1 else np.array([0.0, 0.0, 1.0]),
+        update_seconds=np.asarray(seconds),
+        last_frame=last_frame,
+        skipped=skipped,
+        stopped=stopped,
+        held_out_world=np.concatenate(kept_world),
+        points_used=points_used,
+        points_outside=points_outside,
+    )
+
+
+def return_freed_memory() -> None:
+    """Returns memory that compiling has freed to the system; glibc would keep 0.5 GB of it."""
+    with contextlib.suppress(OSError, AttributeError):  # another libc
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def _up_of_frame(cloud: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """The direction against gravity for a sensor that is carried upright, (3,), world frame.
+
+    A camera sees only what lies in front of it, along z, and its y points down. A LiDAR sees all
+    around, and its z points up.
+    """
+    heights = cloud[np.isfinite(cloud).all(axis=-1), 2]
+    return -pose[:3, 1] if (heights > 0).all() else pose[:3, 2]

@@ -1,0 +1,113 @@
+"""The report of a run: `metrics.json`, and the summary that the terminal shows."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hiosdf_jax._src.command.map_frames import Mapped
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.scoring import table
+from hiosdf_jax._src.state import Flag
+
+_FLAG_WORDS = {
+    Flag.BAD_POSE: "a pose was not finite or not rigid",
+    Flag.EMPTY_CLOUD: "a cloud had no return",
+    Flag.POINTS_OUTSIDE: "points in range fell outside the bounds and left no surface",
+    Flag.TRAINING_FAILED: "a training step was not finite and was undone",
+}
+
+
+def describe(mapped: Mapped, config: Config) -> dict[str, Any]:
+    """Lists everything about a map but its scores.
+
+    Args:
+        mapped: The map.
+        config: Its configuration.
+
+    Returns:
+        Counts, times, flags, the configuration and the device, by the keys of `metrics.json`.
+    """
+    later_ms = 1000 * mapped.update_seconds[1:]  # the first update compiles
+    flags = int(mapped.state.report.flags)
+    return {
+        "updates": int(mapped.state.updates),
+        "frames_skipped": mapped.skipped,
+        "stopped_by": None if mapped.stopped is None else str(mapped.stopped),
+        "compile_s": float(mapped.update_seconds[0]),
+        "update_median_ms": float(np.median(later_ms)) if len(later_ms) else math.nan,
+        "update_p90_ms": float(np.percentile(later_ms, 90)) if len(later_ms) else math.nan,
+        "points_used": mapped.points_used,
+        "points_outside": mapped.points_outside,
+        "flags": [str(flag.name) for flag in Flag if flags & flag],
+        "config": dataclasses.asdict(config),
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def summarize(metrics: dict[str, Any]) -> str:
+    """Formats the metrics of a run for a terminal.
+
+    Args:
+        metrics: From `describe`, with `scores` and `bands`, or `held_out`, if the map was scored.
+
+    Returns:
+        Several lines.
+    """
+    lines = [
+        f"{metrics['updates']} updates on {metrics['device']}: "
+        f"first {metrics['compile_s']:.1f} s (it compiles), then "
+        f"{metrics['update_median_ms']:.0f} ms (median), "
+        f"{metrics['update_p90_ms']:.0f} ms (90 % below)"
+    ]
+    if metrics["frames_skipped"]:
+        lines.append(f"{metrics['frames_skipped']} frames could not be used and were skipped")
+    if metrics["stopped_by"]:
+        lines.append(f"ended early by {metrics['stopped_by']}")
+    for flag in metrics["flags"]:
+        words = _FLAG_WORDS[Flag[flag]]
+        if flag == Flag.POINTS_OUTSIDE.name:
+            outside = metrics["points_outside"]
+            words += f" ({outside} of {outside + metrics['points_used']})"
+        lines.append(f"flag {flag}: {words}")
+    scores = metrics.get("scores") or metrics.get("held_out")
+    if scores:
+        lines += ["", table.format_table(scores), ""]
+    if "bands" in metrics:
+        lines += [table.format_bands(metrics["bands"]), ""]
+    return "\n".join(lines)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes nested dicts, lists, tuples and scalars to a JSON file.
+
+    Args:
+        path: The file.
+        value: What to write; numbers that are not finite become null.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    path.write_text(json.dumps(to_json(value), indent=2) + "\n", "utf-8")
+
+
+def to_json(value: Any) -> Any:
+    """Replaces what JSON cannot represent.
+
+    Args:
+        value: Nested dicts, lists, tuples and scalars.
+
+    Returns:
+        The same, with lists for tuples and None for numbers that are not finite.
+    """
+    if isinstance(value, dict):
+        return {key: to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
