@@ -63,7 +63,7 @@ def test_returns_from_missing_objects_are_left_out():
 def test_a_scene_in_another_frame_is_refused():
     rays = read_rays(room_stream())
     mesh = room_mesh()
-    mesh.apply_scale(1000)  # millimetres
+    mesh.apply_scale(1000)  # millimeters
     with pytest.raises(ValueError, match=r"only 0% of the stream's returns lie within 0\.2 m"):
         sample_visible(mesh_scene(mesh, sensor_path(rays)), rays)
 

@@ -92,12 +92,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from hiosdf_jax._src.demo import apartment
-    from hiosdf_jax._src.demo.primitives import signed_distance
-
     if options.plan:
         _plan(options)
         return
+    from hiosdf_jax._src.demo import apartment
+    from hiosdf_jax._src.demo.primitives import signed_distance
+
     frames = options.frames or _DEMO_FRAMES
     stream = apartment.ApartmentStream(frames=frames, seed=options.seed)
     config = _configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)

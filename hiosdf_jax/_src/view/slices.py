@@ -60,7 +60,7 @@ def save_slices(
     if box.shape != (2, 3) or not (box[1, :2] > box[0, :2]).all():
         raise ValueError(f"bounds = {bounds}, expected ((x0, y0, z0), (x1, y1, z1)), x0 < x1, ...")
     if not len(heights):
-        raise ValueError("heights is empty, expected at least one z in metres")
+        raise ValueError("heights is empty, expected at least one z in meters")
     x, y = _axes(box)
     rows = []
     for height in heights:
