@@ -2,7 +2,7 @@
 
 python -m benchmarks.accuracy --data ../shared/data --streams house_depth --configs light
 
-- `measure` maps a stream and scores it;
+- `sources` opens the streams, and `measure` maps and scores them;
 - `results` gathers the figures of several seeds, lays them out as a table and writes their record;
 - `gate` finds the figures that are worse than in a committed baseline;
 - `figure` draws the error over time.

@@ -12,7 +12,8 @@ from typing import Any
 
 from benchmarks import records
 from benchmarks.accuracy import figure, gate, results
-from benchmarks.accuracy.measure import measure, open_source
+from benchmarks.accuracy.measure import measure
+from benchmarks.accuracy.sources import open_source
 from hiosdf_jax import Config
 
 _BASELINE = records.RESULTS / "accuracy_baseline.json"

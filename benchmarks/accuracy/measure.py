@@ -8,8 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,66 +16,17 @@ from tqdm import tqdm
 
 import hiosdf_jax as hio
 from benchmarks import records
+from benchmarks.accuracy.sources import Source
 from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.field.points import as_field
 from hiosdf_jax._src.grid import lookup
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state import Field, field_of
 
 # Forgetting compares the error in the region of the first frames, right after them and at the end.
 EARLY_FRAMES = 20
 
-# The parts of a mesh tell which surface points are on thin things. The streams' truth does not.
-_MESHES = {"house_depth": "small_house.ply", "house_lidar": "small_house.ply"}
-
 _HELD_OUT_SEED = 0
-
-
-class Source(NamedTuple):
-    """A stream to measure on.
-
-    Attributes:
-        name: Name of the stream.
-        stream: Its frames.
-        truth: Exact distances; None for a real stream, which is scored on held-out frames.
-        extent: Its bounds and range.
-        complete: Whether all frames of the recording are in it.
-    """
-
-    name: str
-    stream: datasets.Stream
-    truth: scoring.GroundTruth | None
-    extent: datasets.Extent
-    complete: bool
-
-
-def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
-    """Opens a stream.
-
-    Args:
-        folder: With NAME.npz.
-        name: Name of the stream; "demo" is the simulated apartment.
-        frames: How many frames to keep, from the first on; all if left out.
-
-    Returns:
-        The stream with its truth and its bounds.
-    """
-    if name == "demo":
-        from hiosdf_jax import demo
-
-        whole = demo.ApartmentStream()
-        truth = demo.ground_truth(whole)
-    else:
-        whole = datasets.NpzStream(folder / f"{name}.npz")
-        truth = datasets.read_truth(folder / f"{name}.npz")
-    count = len(whole) if frames is None else min(frames, len(whole))
-    stream = datasets.FrameStream(name, count, whole.__getitem__)
-    extent = datasets.find_bounds(stream)
-    complete = count == len(whole)
-    if truth is not None and name in _MESHES and complete:
-        truth = _with_thin_parts(folder / _MESHES[name], stream, truth, extent.max_range)
-    return Source(name, stream, truth, extent, complete)
 
 
 def measure(
@@ -95,51 +45,43 @@ def measure(
         A run for JSON with its identity, its times and `variants`. Each of grid, network and
         blended has `scores`, `bands` (scores by band of true distance) and `over_time`.
     """
-    extent = source.extent
     config = getattr(hio.Config, config_name)(
-        extent.bounds, **({"max_range": extent.max_range} | overrides)
+        source.extent.bounds, **({"max_range": source.extent.max_range} | overrides)
     )
-    count = len(source.stream)
-    held_out = scoring.held_out_frames(count) if source.truth is None else range(0)
+    count, truth = len(source.stream), source.truth
+    held_out = scoring.held_out_frames(count) if truth is None else range(0)
     held_out_world = _returns_of(source.stream, held_out, config)
     mapped = [frame for frame in range(count) if frame not in held_out]
+    last = mapped[-1]
     state = hio.init(config, jax.random.key(seed))
     order = np.random.default_rng(seed)
-    times_ms = []
+    times_ms, early = [], {}
     variants = {name: {"scores": {}, "bands": {}, "over_time": []} for name in VARIANTS}
-    early: dict[str, float] = {}
     for frame in tqdm(mapped, desc=f"{source.name} {config_name} seed {seed}", unit="frame"):
         cloud, pose = datasets.read_frame(source.stream, frame)
-        # Which rows of a large cloud are drawn is chance as well, and depends on their order.
+        # The rows that are drawn from a large cloud are random too, and depend on their order.
         cloud = order.permutation(cloud)
         start = time.perf_counter()
         state = jax.block_until_ready(hio.update(state, cloud, pose))
         times_ms.append(1e3 * (time.perf_counter() - start))
-        is_last = frame == mapped[-1]
-        is_due = (frame + 1) % every == 0
-        ends_early = source.truth is not None and frame + 1 == EARLY_FRAMES and not is_last
-        if not (is_last or is_due or ends_early):
+        is_due = (frame + 1) % every == 0 or frame == last
+        ends_early = truth is not None and frame + 1 == EARLY_FRAMES and frame != last
+        if not (is_due or ends_early):
             continue
-        field = as_field(state)
-        assert isinstance(field, Field)
+        field = field_of(state)
         for name, variant in variants.items():
-            ask = _asking(name, field)
-            if source.truth is None:
-                scores = _score_held_out(field, ask, held_out_world)
+            if truth is None:
+                scores = _score_held_out(name, field, held_out_world)
             else:
-                scores = scoring.evaluate(ask, source.truth, pose[:3, 3], frame)
-                if name == "blended":
-                    scores |= scoring.evaluate_lower(
-                        CompiledQueries(field).lower, source.truth, frame
-                    )
+                scores = _score(name, field, truth, pose, frame)
             if ends_early:
                 early[name] = scores["visible_cm"]
-            if is_due or is_last:
+            if is_due:
                 variant["over_time"].append({"frame": frame} | scores)
-            if is_last:
+            if frame == last:
                 variant["scores"] = scores
-            if is_last and source.truth is not None:
-                truth = source.truth
+            if frame == last and truth is not None:
+                ask = _asking(name, field)
                 variant["bands"] = scoring.evaluate_bands(ask, truth, pose[:3, 3], frame)
                 if name in early:
                     first = scoring.evaluate(ask, truth, last_frame=EARLY_FRAMES - 1)
@@ -174,36 +116,31 @@ def _asking(name: str, field: Field) -> Callable[[np.ndarray], tuple[Any, Any]]:
     return lambda points: VARIANTS[name](field, points)
 
 
+def _score(
+    name: str, field: Field, truth: scoring.GroundTruth, pose: np.ndarray, frame: int
+) -> dict[str, float]:
+    """Scores a map against the truth that was seen up to a frame."""
+    scores = scoring.evaluate(_asking(name, field), truth, pose[:3, 3], frame)
+    if name == "blended":
+        scores |= scoring.evaluate_lower(CompiledQueries(field).lower, truth, frame)
+    return scores
+
+
+def _score_held_out(name: str, field: Field, points_world: np.ndarray) -> dict[str, float]:
+    """Scores a map on returns of held-out frames, earlier and later, in observed space."""
+    ask, observed = _asking(name, field), CompiledQueries(field).observed
+    scores = scoring.score_held_out(lambda points: ask(points)[0], observed, points_world)
+    return {key: value for key, value in scores.items() if key in scoring.METRICS}
+
+
 def _returns_of(stream: datasets.Stream, frames: range, config: hio.Config) -> np.ndarray:
-    """Returns of the held-out frames, (n, 3) m, world."""
+    """Draws returns of the held-out frames, (n, 3) m, world frame."""
     rng = np.random.default_rng(_HELD_OUT_SEED)
     parts = [np.empty((0, 3), np.float32)]
     for frame in frames:
         cloud, pose = datasets.read_frame(stream, frame)
         parts.append(scoring.draw_returns(cloud, pose, config, len(frames), rng))
     return np.concatenate(parts)
-
-
-def _score_held_out(
-    field: Field, ask: Callable[[np.ndarray], tuple[Any, Any]], points_world: np.ndarray
-) -> dict[str, float]:
-    """Scores a map on returns of other frames, earlier and later, where it has seen the place."""
-    observed = CompiledQueries(field).observed
-    scores = scoring.score_held_out(lambda points: ask(points)[0], observed, points_world)
-    return {key: value for key, value in scores.items() if key in scoring.METRICS}
-
-
-def _with_thin_parts(
-    mesh: Path, stream: datasets.Stream, truth: scoring.GroundTruth, max_range: float
-) -> scoring.GroundTruth:
-    try:
-        rays = scoring.read_rays(stream, max_range)
-        scene = scoring.read_scene(mesh, scoring.sensor_path(rays))
-    except (FileNotFoundError, ModuleNotFoundError) as error:
-        print(f"thin parts are not scored: {error}")
-        return truth
-    drawn = scoring.sample_visible(scene, rays, count=len(stream))
-    return truth._replace(thin_points_world=drawn.thin_points_world)
 
 
 def _spread(values: list[float]) -> dict[str, float]:
