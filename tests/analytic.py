@@ -27,15 +27,14 @@ def baked(exact_sdf, low, high, resolution):
 
 
 def half_space(normal, offset, reach=8.0):
-    """What lies beyond a plane is solid: sdf = normal . p + offset, which trilinear maps hold
-    exactly, in eight samples."""
+    """The map of a solid half space, sdf = normal . p + offset, exact in eight samples."""
     return baked(
         lambda p: p @ np.asarray(normal, float) + offset, [-reach] * 3, [reach] * 3, 2 * reach
     )
 
 
 def half_spaces(count, seed=0, reach=2.0):
-    """Random ones: normals (count, 3), offsets (count,) and maps."""
+    """Random half spaces: normals (count, 3), offsets (count,) and maps."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -45,7 +44,7 @@ def half_spaces(count, seed=0, reach=2.0):
 
 
 def count_traces(function):
-    """The function, and a list that grows whenever it is traced."""
+    """Returns the function, and a list that grows whenever it is traced."""
     traces = []
 
     def counted(*args, **kwargs):
@@ -56,7 +55,7 @@ def count_traces(function):
 
 
 def _equations(jaxpr):
-    """All equations of a jaxpr and of those in it, each with what made the variables beside it."""
+    """Yields all equations of a jaxpr, nested ones too, with the equations of their variables."""
     made = {}
     for equation in jaxpr.eqns:
         yield equation, made
@@ -70,7 +69,7 @@ def _equations(jaxpr):
 
 
 def _source(variable, made):
-    """The primitive that a variable is the result of, but for its shape."""
+    """Returns the name of the primitive that computed a variable, apart from its shape."""
     equation = made.get(id(variable))
     while equation is not None and equation.primitive.name in ("broadcast_in_dim", "reshape"):
         equation = made.get(id(equation.invars[0]))
@@ -78,10 +77,10 @@ def _source(variable, made):
 
 
 def equalities_with_least(function, *arguments):
-    """How often a function's derivative asks which of some floats equal their least or greatest.
+    """Counts the comparisons of floats with their minimum or maximum in a function's derivative.
 
-    A compiler that computes them twice, rounded in two ways, finds none: an H100 answered a tenth
-    of one map's points with the gradient 0.
+    A compiler may compute both sides with different rounding. Then no float is equal: on an H100,
+    a tenth of one map's points had the gradient 0.
     """
 
     def derivative(*arguments):

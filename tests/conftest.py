@@ -1,10 +1,11 @@
-"""What one test has compiled, the others need not: most of the time of these tests is XLA's."""
+"""Shared compilations and maps: most of the time of these tests is spent in XLA's compiler."""
 
 import os
 import tempfile
 from pathlib import Path
 
 import jax
+import pytest
 
 # The same folder for both workers, and for the commands that tests start.
 _run = os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid()))
@@ -13,3 +14,25 @@ _cache = os.environ.setdefault(
 )
 jax.config.update("jax_compilation_cache_dir", _cache)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+from room import CONFIG, SHARP_CONFIG, map_of_room
+
+import hiosdf_jax as hio
+
+
+@pytest.fixture(scope="session")
+def empty_map():
+    """A map of the room without updates."""
+    return hio.init(CONFIG, jax.random.key(0))
+
+
+@pytest.fixture(scope="session")
+def room_map():
+    """A small map of the room after four frames."""
+    return map_of_room(CONFIG, jax.random.key(0))
+
+
+@pytest.fixture(scope="session")
+def sharp_map():
+    """A map that has learned the room, from twelve frames."""
+    return map_of_room(SHARP_CONFIG, jax.random.key(0), 12, 2000)

@@ -1,5 +1,9 @@
-"""A box-shaped room, a sensor that looks around in it, and a map that is small enough for tests."""
+"""A box-shaped room, a sensor that looks around in it, and maps that are small enough for tests."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import hiosdf_jax as hio
@@ -21,6 +25,13 @@ CONFIG = hio.Config.light(
     warmup_epochs=4,
 )
 
+# Large enough to learn the room, not only to run.
+SHARP_CONFIG = dataclasses.replace(
+    CONFIG, near_samples=2000, far_samples=4000, hidden_width=64, epochs=20, max_points=2000
+)
+
+# A box that `grow` can make of the room's. Most of it is far from all walls.
+LARGER_BOUNDS = ((-2.05, -1.0, -1.5), (1.2, 3.0, 0.8))
 
 # Not on faces of voxels, where rounding decides which voxel a return falls in.
 HALF = np.array([0.97, 0.78, 0.56])
@@ -42,6 +53,7 @@ def room_cloud(seed, count=250, yaw=0.0, position=(0.0, 0.0, 0.0)):
 
 
 def stream(frames=4, count=250):
+    """Posed clouds along a short walk through the room."""
     return [
         room_cloud(i, count, 0.3 * i, (0.1 * i - 0.2, 0.05 * i, 0.02 * i)) for i in range(frames)
     ]
@@ -58,3 +70,19 @@ def map_of_room(config, key, frames=4, count=250):
     for cloud, pose in stream(frames, count):
         state = hio.update(state, cloud, pose)
     return state
+
+
+def arrays_equal(a, b):
+    """Whether all arrays of two maps or parts of maps are equal, bit by bit."""
+
+    def plain(tree):
+        return [
+            np.asarray(
+                jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+            )
+            for x in jax.tree.leaves(tree)
+        ]
+
+    return all(
+        np.array_equal(x, y, equal_nan=True) for x, y in zip(plain(a), plain(b), strict=True)
+    )

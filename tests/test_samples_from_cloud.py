@@ -1,12 +1,14 @@
-"""The local SDF against a k-d tree, and equations 1 and 2 of the paper."""
+"""Training samples from the newest cloud against a k-d tree and the paper's equations."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
+from voxels import rays_to
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.samples import from_cloud
+from hiosdf_jax._src.samples.from_cloud import sample_cloud
 
 CONFIG = hio.Config.light(
     ((-3, -3, -3), (3, 3, 3)), local_points=30, local_ray_samples=8, local_max_range=2.0
@@ -36,9 +38,9 @@ def test_brute_force_distance_against_a_tree():
 
 
 def test_tiles_do_not_change_the_distance(monkeypatch):
-    points, queries = cloud() + 9, cloud(300)  # what fills up the last tile must not be nearer
+    points, queries = cloud() + 9, cloud(300)  # the padding of the last tile must not be nearer
     whole = from_cloud.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
-    for tile in (64, 256):  # both leave a rest
+    for tile in (64, 256):  # neither divides the cloud
         monkeypatch.setattr(from_cloud, "_TILE", tile)
         tiled = from_cloud.nearest_distance(queries, jnp.asarray(points), np.ones(700, bool))
         np.testing.assert_array_equal(whole, tiled)
@@ -46,8 +48,7 @@ def test_tiles_do_not_change_the_distance(monkeypatch):
 
 def test_samples_follow_equations_1_and_2():
     points = cloud()
-    valid = np.ones(700, bool)
-    samples = from_cloud.sample_local(CONFIG, points, valid, SENSOR, jax.random.key(0))
+    samples = sample_cloud(CONFIG, rays_to(points, SENSOR), jax.random.key(0))
     queries = np.asarray(samples.points_world, np.float64)
     exact, _ = cKDTree(points.astype(np.float64)).query(queries)
     np.testing.assert_allclose(np.abs(samples.sdf), exact, atol=1e-5)
@@ -73,10 +74,10 @@ def test_samples_follow_equations_1_and_2():
 def test_padding_changes_nothing():
     points = cloud()
     padded = np.concatenate([points, np.zeros((100, 3), np.float32)])
-    a = from_cloud.sample_local(CONFIG, points, np.ones(700, bool), SENSOR, jax.random.key(0))
-    b = from_cloud.sample_local(CONFIG, padded, np.arange(800) < 700, SENSOR, jax.random.key(0))
+    a = sample_cloud(CONFIG, rays_to(points, SENSOR), jax.random.key(0))
+    b = sample_cloud(CONFIG, rays_to(padded, SENSOR, np.arange(800) < 700), jax.random.key(0))
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x, y)
-    none = from_cloud.sample_local(CONFIG, points, np.zeros(700, bool), SENSOR, jax.random.key(0))
+    none = sample_cloud(CONFIG, rays_to(points, SENSOR, hit=False), jax.random.key(0))
     assert not np.asarray(none.weight).any()
     assert not np.isnan(np.asarray(none.points_world)).any()

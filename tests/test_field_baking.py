@@ -1,21 +1,18 @@
 """A baked field against the field that it was sampled from."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import BOUNDS, CONFIG, HALF, map_of_room
+from room import BOUNDS, HALF
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import lattice
 
 
 @pytest.fixture(scope="module")
-def field():
-    config = dataclasses.replace(CONFIG, max_points=3000)
-    return hio.snapshot(map_of_room(config, jax.random.key(0), 4, 3000), stamp=7.5)
+def field(sharp_map):
+    return hio.snapshot(sharp_map, stamp=7.5)
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +71,11 @@ def test_samples_are_the_fields_answers(field, baked):
     answer, at = hio.query(field, points), tuple(index.T)
     for sampled, asked in ((baked.sdf[at], answer.sdf), (baked.lower[at], answer.lower)):
         error = np.abs(np.asarray(sampled) - asked)
-        # The samples lie on planes through voxels' centres: where rounding decides which voxels
-        # are asked, two patches may have the answer.
+        # The samples lie on planes through voxels' centers. Rounding decides which voxels
+        # are asked there, and two patches may have the answer.
         assert np.mean(error < 1e-5) > 0.95
         assert error.max() < 0.03
-    assert int(baked.updates) == 4
+    assert int(baked.updates) == 12
     assert float(baked.stamp) == 7.5
 
 
@@ -110,7 +107,7 @@ def test_gradient_is_that_of_the_interpolation(baked):
                 baked, chosen - shift, unknown
             )
             agree = np.abs(np.asarray(slope) / (2 * step) - gradient[:, axis]) < 5e-3
-            assert agree.mean() > (0.999 if unknown == "network" else 0.97)  # but where min turns
+            assert agree.mean() > (0.999 if unknown == "network" else 0.97)  # not at kinks of min
 
 
 def test_a_window_moves_without_another_compilation(field):

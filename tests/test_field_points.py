@@ -1,4 +1,4 @@
-"""Queries: defined everywhere, differentiable, the same one by one and by the thousand."""
+"""Queries: defined everywhere, differentiable, equal for one point and for many."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def test_shapes_and_batch_equals_scalar(field):
 
 
 @pytest.mark.parametrize("rows", [32_769, 40_000])
-def test_eager_equals_jit_at_sizes_that_xla_has_got_wrong(field, rows):
+def test_eager_equals_jit_at_sizes_that_xla_has_miscompiled(field, rows):
     points = points_around(rows)
     eager = hio.sdf_and_grad(field, points)
     jitted = jax.jit(hio.sdf_and_grad)(field, points)
@@ -61,7 +61,7 @@ def test_gradient_equals_finite_differences_inside_and_outside(field):
         np.testing.assert_allclose(gradient[away, axis], slope[away], atol=5e-3)
 
 
-def test_outside_the_value_is_the_distance_to_the_box_more(field):
+def test_outside_the_distance_to_the_box_is_added(field):
     corner = np.array([3.0, 1.0, 2.0], np.float32)
     beyond = corner + np.array([3.0, 4.0, 0.0], np.float32)
     np.testing.assert_allclose(hio.sdf(field, beyond), hio.sdf(field, corner) + 5.0, rtol=1e-5)
@@ -103,7 +103,7 @@ def test_a_point_with_a_nan_is_not_safe(field, unknown):
         assert (np.asarray(answer.frontier) < -1e29).all()
 
 
-def test_on_the_faces_of_the_box_the_gradient_is_that_of_the_inside(field):
+def test_on_the_faces_of_the_box_the_gradient_is_the_one_just_inside(field):
     face, inside = np.array([3.0, -0.5, 1.0]), np.array([2.9999, -0.5, 1.0])
     np.testing.assert_allclose(
         hio.sdf_and_grad(field, face)[1], hio.sdf_and_grad(field, inside)[1], atol=2e-2
@@ -122,7 +122,7 @@ def test_forward_mode_and_second_derivatives(field):
     np.testing.assert_allclose(hessian, (high - low) / 2e-2, atol=0.05)
 
 
-def test_lower_outside_is_less_by_the_distance_to_the_box(field):
+def test_outside_the_distance_to_the_box_is_subtracted_from_lower(field):
     corner, beyond = np.array([3.0, 1.0, 2.0]), np.array([6.0, 5.0, 2.0])
     low, far = hio.query(field, corner).lower, hio.query(field, beyond).lower
     np.testing.assert_allclose(far, low - 5.0, rtol=1e-5)
@@ -147,3 +147,40 @@ def test_queries_are_differentiable_by_the_weights(field):
     norms = [float(jnp.linalg.norm(leaf)) for leaf in jax.tree.leaves(gradient.params)]
     assert all(np.isfinite(norms))
     assert max(norms) > 0
+
+
+def test_points_outside_have_not_been_seen(room_map):
+    outside = np.array([[1.3, 0, 0], [0, 0, -5.0], [3e38, 0, 0]], np.float32)
+    answer = hio.query(room_map, outside)
+    assert not np.asarray(answer.observed).any()
+    assert np.all(np.asarray(answer.frontier)[:2] <= [-0.1, -4.2])
+    assert np.isfinite(np.asarray(answer.frontier)).all()
+
+
+def test_unseen_space_is_an_obstacle_on_request(room_map):
+    points = np.random.default_rng(2).uniform(-1.4, 1.4, (3000, 3)).astype(np.float32)
+    plain, solid = hio.query(room_map, points), hio.query(room_map, points, unknown="obstacle")
+    expected = np.minimum(plain.sdf, plain.frontier)
+    np.testing.assert_allclose(solid.sdf, expected, atol=1e-6)
+    assert (np.asarray(solid.sdf)[~np.asarray(solid.observed)] <= 0).all()
+    assert 0.2 < np.mean(np.asarray(plain.sdf) > plain.frontier) < 0.98
+    np.testing.assert_array_equal(solid.frontier, plain.frontier)
+    np.testing.assert_array_equal(solid.lower, plain.lower)
+    np.testing.assert_allclose(hio.sdf(room_map, points, unknown="obstacle"), solid.sdf, atol=1e-6)
+    # Where the frontier is nearer than the surface, the gradient is that of the frontier.
+    step = 1e-3
+    unseen_nearer = np.asarray(plain.frontier) < np.asarray(plain.sdf) - 0.05
+    for axis in range(3):
+        shift = np.zeros(3, np.float32)
+        shift[axis] = step
+        high = hio.sdf(room_map, points + shift, unknown="obstacle")
+        low = hio.sdf(room_map, points - shift, unknown="obstacle")
+        slope = np.asarray(high - low) / (2 * step)
+        agrees = np.abs(slope - np.asarray(solid.grad)[:, axis]) < 0.02
+        assert agrees[unseen_nearer].mean() > 0.95  # not at faces of cells
+
+
+def test_another_policy_is_refused_by_name(room_map):
+    for function in (hio.sdf, hio.sdf_and_grad, hio.query):
+        with pytest.raises(ValueError, match="unknown is 'free', expected 'network' or 'obstacle'"):
+            function(room_map, np.zeros(3), unknown="free")

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from room import HALF
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import mesh
@@ -35,14 +36,14 @@ def test_sphere():
     assert (np.sum(found.face_normals * outwards, axis=-1)[real] > 0.9).all()
 
 
-def test_a_room_faces_inwards():
+def test_the_faces_of_a_room_point_inwards():
     sdf = -sphere_samples()
     found = mesh_from_samples(sdf, np.ones(sdf.shape, bool), CORNER, 0.05)
     assert found.is_watertight
     assert found.volume == pytest.approx(-4 / 3 * np.pi * 0.8**3, rel=0.01)
 
 
-def test_a_box_on_the_samples_themselves():
+def test_a_box_with_faces_on_the_samples():
     corner, resolution = np.zeros(3), 0.25  # exact in binary: the faces' samples are exactly 0
     points = resolution * np.stack(np.indices((13, 13, 13)), axis=-1)
     outside = np.abs(points - 1.5) - np.array([1.0, 0.75, 0.5])
@@ -54,7 +55,7 @@ def test_a_box_on_the_samples_themselves():
     assert 0.8 * 3.0 < found.volume < 3.0
 
 
-def test_only_what_was_observed():
+def test_only_observed_space_has_a_surface():
     sdf = sphere_samples()
     observed = lattice(0.05)[..., 0] < CENTER[0]
     found = mesh_from_samples(sdf, observed, CORNER, 0.05)
@@ -67,7 +68,7 @@ def test_only_what_was_observed():
     assert farther.vertices[:, 0].max() == pytest.approx(last + 0.15, abs=1e-5)
 
 
-def test_nobody_saw_the_back_of_a_wall():
+def test_the_unseen_back_of_a_wall_is_no_surface():
     # Free for x < 1, behind the surface for 0.27 m, and then the map guesses "free" again.
     x = lattice(0.05, (80, 10, 10))[..., 0]
     sdf = np.maximum(1.0 - x, x - 1.27)
@@ -126,16 +127,17 @@ def test_misuse_is_named():
 
 
 @pytest.fixture
-def empty_map():
+def uneven_map():
+    """An empty map whose bounds are no multiples of the voxel size."""
     config = hio.Config.light(bounds=((-1.03, -1.2, -0.9), (1.1, 1.0, 1.3)), voxel_size=0.1)
     return hio.init(config, jax.random.key(0))
 
 
-def test_a_map_is_sampled_over_its_bounds(monkeypatch, empty_map):
+def test_a_map_is_sampled_over_its_bounds(monkeypatch, uneven_map):
     shapes, samples = set(), []
 
     def sphere_query(field, points):
-        """Stands in for a trained map: the sphere, of which what lies below was observed."""
+        """Stands in for a trained map: a sphere whose lower part was observed."""
         shapes.add(points.shape)
         jax.debug.callback(lambda p: samples.append(np.asarray(p)), points)
         sdf = jnp.linalg.norm(points - CENTER, axis=-1) - 0.8
@@ -146,11 +148,11 @@ def test_a_map_is_sampled_over_its_bounds(monkeypatch, empty_map):
     # A function of its own: JAX shares compilations between the jitted forms of one function.
     monkeypatch.setattr(mesh, "_sample", jax.jit(lambda *arguments: plain(*arguments)))
     monkeypatch.setattr(mesh, "_CHUNK", 1000)
-    found = extract_mesh(empty_map, resolution=0.05)
+    found = extract_mesh(uneven_map, resolution=0.05)
     jax.effects_barrier()
     assert shapes == {(1000, 3)}
     assert mesh._sample._cache_size() == 1
-    low, high = np.asarray(empty_map.config.bounds)
+    low, high = np.asarray(uneven_map.config.bounds)
     samples = np.concatenate(samples)
     np.testing.assert_allclose(samples.min(axis=0), low, atol=1e-6)
     assert (samples.max(axis=0) >= high - 1e-6).all()
@@ -161,28 +163,17 @@ def test_a_map_is_sampled_over_its_bounds(monkeypatch, empty_map):
     assert found.vertices[:, 2].min() == pytest.approx(CENTER[2] - 0.8, abs=1e-3)
 
 
-def test_an_empty_map_has_an_empty_mesh(empty_map):
-    assert len(extract_mesh(empty_map, resolution=0.2).faces) == 0
+def test_an_empty_map_has_an_empty_mesh(uneven_map):
+    assert len(extract_mesh(uneven_map, resolution=0.2).faces) == 0
 
 
-def test_a_mapped_room():
-    """A wall at x = 2 m, mapped from one cloud and meshed to within the network's error."""
-    config = hio.Config.light(
-        bounds=((-0.5, -2, -2), (2.5, 2, 2)),
-        max_points=1600,
-        max_range=4.0,
-        distance_horizon=1.0,
-        hidden_width=64,
-    )
-    angles = np.stack(np.meshgrid(*[np.linspace(-0.6, 0.6, 40)] * 2), axis=-1).reshape(-1, 2)
-    cloud = np.concatenate([np.full((len(angles), 1), 2.0), 2 * np.tan(angles)], axis=-1)
-    state = hio.init(config, jax.random.key(0))
-    for _ in range(3):
-        state = hio.update(state, cloud.astype(np.float32), np.eye(4, dtype=np.float32))
-    for field in (state, hio.snapshot(state)):
-        found = extract_mesh(field, resolution=0.1)
-        wall = np.abs(found.vertices[:, 1:]).max(axis=-1) < 0.9
+def test_a_mapped_room(sharp_map):
+    """The wall at x = 0.97 m, meshed to within the map's error."""
+    for field in (sharp_map, hio.snapshot(sharp_map)):
+        found = extract_mesh(field, resolution=0.05)
+        near = np.abs(found.vertices[:, 0] - HALF[0]) < 0.2
+        wall = near & (np.abs(found.vertices[:, 1:]) < HALF[1:] - 0.15).all(axis=-1)
         assert wall.sum() > 200
-        assert np.median(np.abs(found.vertices[wall, 0] - 2)) < 0.05
-        towards_sensor = found.face_normals[np.abs(found.triangles_center[:, 0] - 2) < 0.1]
+        assert np.median(np.abs(found.vertices[wall, 0] - HALF[0])) < 0.05
+        towards_sensor = found.face_normals[np.abs(found.triangles_center[:, 0] - HALF[0]) < 0.1]
         assert np.median(towards_sensor[:, 0]) < -0.9

@@ -1,4 +1,4 @@
-"""The least of several values, and that no derivative rests on two floats being equal."""
+"""The least of several values, and derivatives that do not depend on equal floats."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def test_least():
 
 @pytest.mark.parametrize("unknown", ["network", "obstacle"])
 @pytest.mark.parametrize("kind", ["field", "baked"])
-def test_no_derivative_of_a_query_rests_on_equal_floats(field, kind, unknown):
+def test_no_derivative_of_a_query_depends_on_equal_floats(field, kind, unknown):
     asked = field if kind == "field" else hio.bake(field, resolution=0.5)
     points, radii = jnp.zeros((4, 3)), jnp.full(4, 0.1)
     for function in (
@@ -43,7 +43,7 @@ def test_no_derivative_of_a_query_rests_on_equal_floats(field, kind, unknown):
         assert equalities_with_least(function, points) == 0
 
 
-def test_such_a_derivative_would_be_noticed():
+def test_such_a_derivative_would_be_found():
     if not equalities_with_least(lambda d: jnp.min(d, axis=-1), jnp.ones((2, 3))):
         pytest.skip("this version of jax compares in another way")
     assert equalities_with_least(jax.jit(lambda d: jnp.max(jnp.sin(d), axis=0)), jnp.ones((2, 3)))

@@ -1,12 +1,11 @@
-"""Mapping in a thread: the same map, fields that stay valid, a planner that never waits."""
+"""Mapping in a thread: the same map, valid fields, and a planner that never waits."""
 
 import threading
 import time
 
-import jax
 import numpy as np
 import pytest
-from room import CONFIG, stream
+from room import stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping import background
@@ -14,14 +13,9 @@ from hiosdf_jax._src.mapping import background
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def empty():
-    return hio.init(CONFIG, jax.random.key(0))
-
-
-def test_the_map_is_that_of_a_plain_loop(empty):
-    expected = empty
-    with hio.BackgroundMapper(empty) as mapper:
+def test_the_map_is_that_of_a_plain_loop(empty_map):
+    expected = empty_map
+    with hio.BackgroundMapper(empty_map) as mapper:
         for k, (cloud, pose) in enumerate(stream(3)):
             mapper.put(cloud, pose, stamp=0.5 * k)
             state = mapper.wait()
@@ -33,7 +27,7 @@ def test_the_map_is_that_of_a_plain_loop(empty):
     np.testing.assert_array_equal(state.grid.evidence.hits, expected.grid.evidence.hits)
 
 
-def test_the_newest_frame_takes_the_place_of_one_that_waits(empty, monkeypatch):
+def test_the_newest_frame_replaces_the_waiting_one(empty_map, monkeypatch):
     begun, go = threading.Event(), threading.Event()
     fused = []
 
@@ -44,7 +38,7 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(empty, monkeypatch):
         return state
 
     monkeypatch.setattr(background, "update", slow)
-    mapper = hio.BackgroundMapper(empty)
+    mapper = hio.BackgroundMapper(empty_map)
     mapper.put("first", None)
     assert begun.wait(10)
     before = mapper.field
@@ -61,9 +55,9 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(empty, monkeypatch):
         mapper.put(5, None)
 
 
-def test_a_bad_frame_is_counted_and_the_map_goes_on(empty):
+def test_a_bad_frame_is_counted_and_mapping_continues(empty_map):
     cloud, pose = stream(1)[0]
-    with hio.BackgroundMapper(empty) as mapper:
+    with hio.BackgroundMapper(empty_map) as mapper:
         mapper.put(cloud, np.full((4, 4), np.nan))
         mapper.wait()
         mapper.put(cloud, pose)
@@ -72,12 +66,12 @@ def test_a_bad_frame_is_counted_and_the_map_goes_on(empty):
     assert int(mapper.field.updates) == 1
 
 
-def test_a_failure_of_the_thread_is_told_to_the_caller(empty, monkeypatch):
+def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch):
     def broken(*_):
         raise OSError("no device")
 
     monkeypatch.setattr(background, "update", broken)
-    mapper = hio.BackgroundMapper(empty)
+    mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
         mapper.wait()

@@ -1,0 +1,102 @@
+"""The blend of grid and network, and its lower bound."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import CONFIG, HALF, LARGER_BOUNDS, map_of_room
+
+import hiosdf_jax as hio
+from hiosdf_jax._src.field import blend
+from hiosdf_jax._src.grid import lookup
+from hiosdf_jax._src.state import surface_of
+
+
+@pytest.fixture(scope="module")
+def field(room_map):
+    return hio.snapshot(room_map)
+
+
+def points_inside(count=400):
+    return np.random.default_rng(0).uniform(-HALF, HALF, (count, 3)).astype(np.float32)
+
+
+def test_near_surfaces_the_network_corrects_the_grid_by_its_share(field):
+    points = points_inside()
+    grid = np.asarray(lookup.grid_sdf(CONFIG, field.surface, jnp.asarray(points)), float)
+    network = np.asarray(blend.network_sdf(field, jnp.asarray(points)), float)
+    assert np.abs(network - grid).max() > 0.1 > np.abs(network - grid).min()
+    limit = np.minimum(0.1, np.abs(grid))  # surfaces stay where the grid has them
+    expected = grid + 0.1 * np.clip(network - grid, -limit, limit)
+    assert (np.abs(grid) < 0.8).all()  # of a horizon of 1 m
+    np.testing.assert_allclose(hio.sdf(field, points), expected, atol=1e-5)
+
+
+def test_beyond_the_horizon_the_network_answers_alone():
+    config = dataclasses.replace(CONFIG, bounds=LARGER_BOUNDS)
+    field = hio.snapshot(map_of_room(config, jax.random.key(0)))
+    y = np.linspace(0.8, 2.9, 400)
+    points = np.stack([0 * y, y, 0 * y], axis=1).astype(np.float32)
+    network = np.asarray(blend.network_sdf(field, jnp.asarray(points)))
+    value = np.asarray(hio.sdf(field, points))
+    np.testing.assert_allclose(value[y > 1.8], network[y > 1.8], atol=1e-6)
+    assert np.abs(value - network)[y < 0.9].max() > 0.01
+    assert np.abs(np.diff(value)).max() < 0.06  # no jump between the two
+
+
+def test_the_papers_map_is_the_network_alone(field):
+    paper = field.replace(config=dataclasses.replace(CONFIG, grid_share=0.0))
+    points = jnp.asarray(points_inside())
+    network = blend.network_sdf(paper, points)
+    np.testing.assert_allclose(hio.sdf(paper, points), network, atol=1e-6)
+
+
+def test_lower_is_below_and_by_more_where_grid_and_network_disagree(field):
+    points = points_inside(2000)
+    answer = hio.query(field, points)
+    slack = np.asarray(answer.sdf) - np.asarray(answer.lower)
+    assert (slack > 0).all()
+    gap = np.abs(blend.network_sdf(field, points) - lookup.grid_sdf(CONFIG, field.surface, points))
+    order = np.argsort(gap)
+    assert slack[order[-500:]].mean() > 1.2 * slack[order[:500]].mean()
+    wilder = field.replace(optimism=field.optimism + 1)
+    assert (np.asarray(hio.query(wilder, points).lower) < answer.lower).all()
+
+
+def test_the_error_scale_adds_gap_and_spread(field):
+    points = jnp.asarray(points_inside())
+    rough = field.surface.replace(axes=field.surface.axes.at[..., 2, :].multiply(200.0))
+    field = field.replace(surface=rough)  # the room's walls are smooth
+    nearest = lookup.nearest_patch(CONFIG, field.surface, points)
+    gap = np.abs(blend.network_sdf(field, points) - nearest.sdf)
+    _, scale = blend.cautious_sdf(field, points)
+    spread = np.asarray(nearest.spread)
+    assert spread.max() > 0.01
+    expected = 0.3 * 0.1 + 0.5 * np.minimum(gap, 0.1) + spread
+    np.testing.assert_allclose(scale, expected, atol=1e-6)
+
+
+def test_beyond_the_bounds_nothing_is_doubtful(field):
+    derived = field.surface.derived
+    surface = field.surface.replace(derived=derived.replace(doubt=jnp.zeros_like(derived.doubt)))
+    low = np.asarray(CONFIG.bounds[0], np.float32)
+    face = jnp.asarray([[low[0], 0.05, 0.05], [low[0] + 0.05, 0.05, 0.05]])
+    value = lookup.doubt_distance(CONFIG, surface, face)
+    np.testing.assert_allclose(value, [0.5 * CONFIG.distance_horizon, 0], atol=1e-5)
+
+
+def test_a_carved_surface_still_counts_for_the_lower_bound(empty_map):
+    """A return that later rays went through is no surface, but may have been a thin one."""
+    pose = np.eye(4)
+    thing = np.array([[0.45, 0.05, 0.05]] * 3)
+    state = hio.update(empty_map, thing, pose)
+    here = jnp.asarray(thing[:1], jnp.float32)
+    assert abs(float(lookup.grid_sdf(CONFIG, surface_of(state.grid), here)[0])) < 0.01
+    wall = np.array([[0.95, 0.1, 0.1]]) + np.random.default_rng(0).uniform(0, 1e-3, (40, 3))
+    for _ in range(2):
+        state = hio.update(state, wall * [1, 0.5, 0.5], pose)
+    assert float(lookup.grid_sdf(CONFIG, surface_of(state.grid), here)[0]) > 0.3
+    assert float(lookup.doubt_distance(CONFIG, surface_of(state.grid), here)[0]) < 0.1
+    assert float(hio.query(state, here).lower[0]) < 0.05

@@ -1,0 +1,61 @@
+"""Calibration of the lower bound on the returns of the newest cloud."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import CONFIG, HALF
+from voxels import rays_to
+
+import hiosdf_jax as hio
+from hiosdf_jax._src.field import blend
+from hiosdf_jax._src.mapping import calibration
+from hiosdf_jax._src.mapping.calibration import calibrate_bound
+
+
+@pytest.fixture
+def field(room_map):
+    """A map that has learned nothing about its bound."""
+    return hio.snapshot(room_map).replace(updates=jnp.int32(0), optimism=jnp.float32(9))
+
+
+def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypatch):
+    def known(_, points):
+        return (points[:, 0] + offset) * 0.5, jnp.full(len(points), 0.5)  # a ratio of x + offset
+
+    offset = 1.0
+
+    monkeypatch.setattr(blend, "cautious_sdf", known)
+    points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 3)), jnp.float32)
+    seen = np.asarray(hio.query(field, points).observed)
+    assert seen.mean() > 0.5
+    sensor = jnp.asarray([0.3, 0.0, 0.0])
+    # A return stands for a piece of surface that grows with its range squared.
+    area = np.sum((np.asarray(points) - np.asarray(sensor)) ** 2, axis=1)[seen]
+    ordered = np.argsort(points[:, 0][seen])
+    share = np.cumsum(area[ordered]) / area.sum()
+    expected = offset + float(points[:, 0][seen][ordered][np.argmax(share >= 0.945)])
+
+    def calibrate(field, ends):
+        rays = rays_to(points, sensor, np.asarray(ends))
+        return float(calibrate_bound(field, rays, jax.random.key(0)))
+
+    every = np.ones(5000, bool)
+    assert abs(calibrate(field, every) - expected) < 0.02
+    later = field.replace(updates=jnp.int32(1000))
+    assert abs(calibrate(later, every) - (0.98 * 9 + 0.02 * expected)) < 0.01
+    assert calibrate(field, ~seen) == 9
+    assert calibrate(field, np.zeros(5000, bool)) == 9
+    few = seen & (np.cumsum(seen) <= 1)  # drawn 2,000 times, which is enough
+    assert calibrate(field, few) != 9
+    offset = -1.0  # the map agrees with all returns, and free space still needs some margin
+    assert calibrate(field, every) == pytest.approx(calibration._LEAST)
+
+
+def test_too_few_observed_returns_calibrate_nothing(field):
+    known = np.random.default_rng(0).uniform(-HALF, HALF, (2000, 3)).astype(np.float32)
+    points = np.where(np.arange(2000)[:, None] % 40 == 0, known, 0.999 * np.array(CONFIG.bounds[1]))
+    seen = np.asarray(hio.query(field, points.astype(np.float32)).observed)
+    assert 0 < seen.sum() < 60  # of 2,000 that are drawn with replacement
+    rays = rays_to(points, np.zeros(3))
+    assert float(calibrate_bound(field, rays, jax.random.key(0))) == 9

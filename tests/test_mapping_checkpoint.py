@@ -1,0 +1,204 @@
+"""Saved maps: complete, safe from crashes, and readable by later versions."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from room import arrays_equal, stream
+
+import hiosdf_jax as hio
+
+
+def test_a_loaded_map_continues_bit_by_bit(room_map, tmp_path):
+    path = tmp_path / "map.npz"
+    hio.save(path, room_map)
+    loaded = hio.load(path)
+    assert loaded.config == room_map.config
+    assert arrays_equal(loaded, room_map)
+    frame = stream(6)[5]
+    assert arrays_equal(hio.update(loaded, *frame), hio.update(room_map, *frame))
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+def test_a_saved_file_has_the_permissions_of_any_other(room_map, tmp_path):
+    hio.save(tmp_path / "map.npz", room_map)
+    (tmp_path / "other").write_bytes(b"")
+    assert (tmp_path / "map.npz").stat().st_mode == (tmp_path / "other").stat().st_mode
+    assert {path.name for path in tmp_path.iterdir()} == {"map.npz", "other"}
+
+
+def test_a_failed_save_keeps_the_old_file(room_map, tmp_path, monkeypatch):
+    path = tmp_path / "map.npz"
+    hio.save(path, room_map)
+    before = path.read_bytes()
+
+    def fail(*_, **__):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        hio.save(path, room_map)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+def test_load_names_what_is_wrong(room_map, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        hio.load(tmp_path / "none.npz")
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(ValueError, match=r"broken.npz is not a readable"):
+        hio.load(broken)
+    picture = tmp_path / "picture.png"
+    picture.write_bytes(b"\x89PNG and no archive")
+    with pytest.raises(ValueError, match=r"picture.png is not a readable .npz file: it is none$"):
+        hio.load(picture)
+    with pytest.raises(FileNotFoundError, match=r"no such folder.*nowhere'"):
+        hio.save(tmp_path / "nowhere" / "map", room_map)
+    foreign = tmp_path / "foreign.npz"
+    np.savez(foreign, a=np.zeros(3))
+    with pytest.raises(ValueError, match=r"foreign.npz is not a hiosdf_jax map"):
+        hio.load(foreign)
+    path = tmp_path / "map.npz"
+    hio.save(path, room_map)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    short = {name: array for name, array in arrays.items() if name != "grid.hits"}
+    np.savez(path, **short)
+    with pytest.raises(ValueError, match=r"lacks the array grid\.hits"):
+        hio.load(path)
+    np.savez(path, **(arrays | {"grid.hits": arrays["grid.hits"][1:]}))
+    with pytest.raises(ValueError, match=r"has grid\.hits of float16"):
+        hio.load(path)
+    newer = str(arrays["header"]).replace('"version": 2', '"version": 99')
+    np.savez(path, **(arrays | {"header": np.asarray(newer)}))
+    with pytest.raises(ValueError, match="format version 99, expected 2"):
+        hio.load(path)
+
+
+def file_of_version_2():
+    """The arrays of a saved map under their names in the file, with random values."""
+    fields = {
+        "bounds": [[-0.2, 0.1, 0.0], [0.2, 0.4, 0.2]],
+        "max_points": 300,
+        "min_range": 0.2,
+        "max_range": 4.5,
+        "range_noise": [0.005, 0.002],
+        "voxel_size": 0.1,
+        "min_hits": 3,
+        "min_hit_ratio": 0.2,
+        "evidence_limit": 90.0,
+        "distance_horizon": 1.0,
+        "frontier_horizon": 0.9,
+        "near_samples": 400,
+        "far_samples": 500,
+        "near_distance": 0.06,
+        "local_points": 20,
+        "local_ray_samples": 5,
+        "local_truncation": 0.3,
+        "local_max_range": 5.0,
+        "hidden_width": 4,
+        "hidden_layers": 1,
+        "frequency": 11.0,
+        "sdf_weight": 4.0,
+        "eikonal_weight": 1.5,
+        "eikonal_every": 2,
+        "learning_rate": 0.001,
+        "weight_decay": 0.01,
+        "batches": 2,
+        "epochs": 3,
+        "warmup_epochs": 6,
+        "warmup_updates": 7,
+        "weight_average": 0.7,
+        "grid_share": 0.8,
+    }
+    header = {
+        "format": "hiosdf_jax map",
+        "version": 2,
+        "config": fields,
+        "key": "threefry2x32",
+    }
+    arrays = {
+        "grid.hits": ((4, 3, 2), np.float16),
+        "grid.passes": ((4, 3, 2), np.float16),
+        "grid.behind": ((4, 3, 2), np.float16),
+        "grid.weight": ((4, 3, 2), np.float16),
+        "grid.surface.mean": ((4, 3, 2, 3), np.float16),
+        "grid.surface.axes": ((4, 3, 2, 3, 3), np.float16),
+        "grid.surface.nearest": ((4, 3, 2, 3), np.int8),
+        "grid.surface.sdf": ((4, 3, 2), np.float16),
+        "grid.surface.doubt": ((4, 3, 2), np.float16),
+        "grid.surface.frontier": ((4, 3, 2), np.int8),
+        "network.origin_world": ((3,), np.float32),
+        "network.optimizer.0.count": ((), np.int32),
+        "optimism": ((), np.float32),
+        "key": ((2,), np.uint32),
+        "updates": ((), np.int32),
+        "report.points_used": ((), np.int32),
+        "report.points_outside": ((), np.int32),
+        "report.points_out_of_range": ((), np.int32),
+        "report.points_invalid": ((), np.int32),
+        "report.sdf_loss": ((), np.float32),
+        "report.eikonal_loss": ((), np.float32),
+        "report.flags": ((), np.uint32),
+    }
+    for copy in ("params", "served", "optimizer.0.mu", "optimizer.0.nu"):
+        for layer, (inputs, outputs) in enumerate([(3, 4), (4, 4), (4, 1)]):
+            name = f"network.{copy}.params.Dense_{layer}"
+            arrays[f"{name}.kernel"] = ((inputs, outputs), np.float32)
+            arrays[f"{name}.bias"] = ((outputs,), np.float32)
+    rng = np.random.default_rng(0)
+    values = {
+        name: rng.uniform(0, 100, shape).astype(dtype) for name, (shape, dtype) in arrays.items()
+    }
+    return header, values
+
+
+def test_a_file_of_format_version_2_still_loads(tmp_path):
+    header, arrays = file_of_version_2()
+    np.savez(tmp_path / "old.npz", header=np.asarray(json.dumps(header)), **arrays)
+    state = hio.load(tmp_path / "old.npz")
+    assert json.loads(json.dumps(dataclasses.asdict(state.config))) == header["config"]
+    evidence, derived, network = state.grid.evidence, state.grid.derived, state.network
+    places = {
+        "grid.hits": evidence.hits,
+        "grid.passes": evidence.passes,
+        "grid.behind": evidence.behind,
+        "grid.weight": evidence.root_weight,
+        "grid.surface.mean": evidence.mean,
+        "grid.surface.axes": evidence.axes,
+        "grid.surface.nearest": derived.nearest,
+        "grid.surface.sdf": derived.sdf,
+        "grid.surface.doubt": derived.doubt,
+        "grid.surface.frontier": derived.frontier,
+        "network.params.params.Dense_1.kernel": network.params["params"]["Dense_1"]["kernel"],
+        "network.served.params.Dense_1.kernel": network.average["params"]["Dense_1"]["kernel"],
+        "network.served.params.Dense_2.bias": network.average["params"]["Dense_2"]["bias"],
+        "network.optimizer.0.mu.params.Dense_0.bias": network.optimizer[0].mu["params"]["Dense_0"][
+            "bias"
+        ],
+        "network.optimizer.0.nu.params.Dense_0.bias": network.optimizer[0].nu["params"]["Dense_0"][
+            "bias"
+        ],
+        "network.origin_world": network.origin_world,
+        "optimism": state.optimism,
+        "key": jax.random.key_data(state.key),
+        "report.flags": state.report.flags,
+    }
+    for name, array in places.items():
+        np.testing.assert_array_equal(array, arrays[name], err_msg=name)
+
+
+def test_names_in_a_file_do_not_change(tmp_path):
+    """They are part of its format; attributes of the code may be renamed."""
+    header, arrays = file_of_version_2()
+    config = hio.Config(**header["config"])
+    hio.save(tmp_path / "map.npz", hio.init(config, jax.random.key(0)))
+    with np.load(tmp_path / "map.npz") as file:
+        saved = {name: (file[name].shape, file[name].dtype) for name in file.files}
+        written = json.loads(str(file["header"]))
+    assert saved.pop("header") is not None
+    assert saved == {name: (array.shape, array.dtype) for name, array in arrays.items()}
+    assert written == header

@@ -1,0 +1,338 @@
+"""The contract of the whole map: purity, transformations, bad input and growth."""
+
+import dataclasses
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import BOUNDS, CONFIG, HALF, LARGER_BOUNDS, arrays_equal, room_cloud, room_sdf, stream
+
+import hiosdf_jax as hio
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.mapping import pipeline
+
+
+def closeness(a, b):
+    """Largest difference between two maps' answers, m."""
+    points = np.random.default_rng(0).uniform(BOUNDS[0], BOUNDS[1], (500, 3)).astype(np.float32)
+    return float(jnp.max(jnp.abs(hio.sdf(a, points) - hio.sdf(b, points))))
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    """Maps a stream of 250 points per frame inside a jit of the user, and queries the result."""
+
+    @jax.jit
+    def scan(state, clouds, poses, points):
+        last, reports = jax.lax.scan(
+            lambda s, x: (hio.update(s, *x), s.report), state, (clouds, poses)
+        )
+        return last, reports, hio.sdf_and_grad(last, points)
+
+    return scan
+
+
+def test_the_map_learns_the_room(sharp_map):
+    """All stages together, at a size that can learn: a box has an exact SDF."""
+    points = np.random.default_rng(1).uniform(-0.95, 0.95, (2000, 3)) * HALF
+    gaps, exact = HALF - np.abs(points), room_sdf(points)
+    answer = hio.query(sharp_map, points)
+    assert np.abs(np.asarray(answer.sdf) - exact).mean() < 0.02
+    assert np.asarray(answer.observed).mean() > 0.98
+    slack = exact - np.asarray(answer.lower)
+    assert np.mean(slack >= 0) >= 0.99
+    assert slack.mean() < 0.04
+    # Near one wall and far from the others the gradient is that wall's normal.
+    sure = (exact < 0.15) & (np.sort(gaps, axis=1)[:, 1] > 0.3)
+    wall = np.argmin(gaps[sure], axis=1)
+    normal = -np.sign(points[sure]) * (np.arange(3) == wall[:, None])
+    assert sure.sum() > 50
+    assert np.mean(np.sum(np.asarray(answer.grad)[sure] * normal, axis=1)) > 0.9
+    outside = hio.query(sharp_map, np.array([[9.0, 0, 0], [0, 0, -7.0]]))
+    assert not np.asarray(outside.observed).any()
+
+
+def test_update_is_pure(empty_map):
+    cloud, pose = stream(1)[0]
+    before = jax.tree.map(jnp.copy, empty_map)
+    first = hio.update(empty_map, cloud, pose)
+    again = hio.update(empty_map, cloud, pose)
+    assert arrays_equal(first, again)
+    assert arrays_equal(before, empty_map)
+    assert not arrays_equal(first.grid, empty_map.grid)
+
+
+def test_no_leaf_is_weakly_typed(empty_map, room_map):
+    """A weakly typed leaf would compile `update` twice."""
+    for state in (empty_map, room_map):
+        assert not [leaf for leaf in jax.tree.leaves(state) if getattr(leaf, "weak_type", False)]
+
+
+def test_one_compilation_for_clouds_of_any_size(empty_map, room_map):
+    """Mapping `room_map` compiled `update` for 250 points."""
+    state, before = empty_map, pipeline._update_jit._cache_size()
+    for count in (1, 40, 299, 300, 301, 900):
+        state = hio.update(state, *room_cloud(count, count))
+    assert pipeline._update_jit._cache_size() == before
+    assert int(state.updates) == 6
+    assert int(state.report.points_used) == 300
+
+
+def test_scan_and_user_jit_equal_the_eager_loop(scanned, empty_map, room_map):
+    clouds, poses = (jnp.stack(part) for part in zip(*stream(), strict=True))
+    points = jnp.zeros((5, 3))
+    last, reports, (value, gradient) = scanned(empty_map, clouds, poses, points)
+    # The cloud is not padded inside jit (250 rows, not 300): the result must not depend on that.
+    assert arrays_equal(last.grid.evidence.hits, room_map.grid.evidence.hits)
+    assert closeness(last, room_map) < 1e-5
+    assert int(last.updates) == 4
+    assert reports.points_used.shape == (4,)
+    expected = hio.sdf_and_grad(room_map, points)
+    np.testing.assert_allclose(value, expected[0], atol=1e-5)
+    np.testing.assert_allclose(gradient, expected[1], atol=1e-4)
+
+
+def test_vmap_over_two_maps_equals_each(empty_map):
+    other = hio.init(CONFIG, jax.random.key(1))
+    frames = stream(2)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), empty_map, other)
+    clouds, poses = (jnp.stack(part) for part in zip(*frames, strict=True))
+    together = jax.jit(jax.vmap(hio.update))(both, clouds, poses)
+    for k, state in enumerate((empty_map, other)):
+        alone = hio.update(state, *frames[k])
+        part = jax.tree.map(lambda leaf, k=k: leaf[k], together)
+        assert arrays_equal(part.grid.evidence.hits, alone.grid.evidence.hits)
+        assert arrays_equal(part.grid.evidence.passes, alone.grid.evidence.passes)
+        assert closeness(part, alone) < 1e-4
+
+
+def test_invalid_rows_change_nothing(empty_map):
+    cloud, pose = stream(1)[0]
+    rows = np.full((300, 3), np.nan, np.float32)
+    rows[:250] = cloud
+    rows[260] = [np.inf, 0, 0]
+    rows[270] = [0, -np.inf, np.nan]
+    a, b = hio.update(empty_map, cloud, pose), hio.update(empty_map, rows, pose)
+    assert arrays_equal(a.grid, b.grid)
+    assert arrays_equal(a.network, b.network)
+    assert int(b.report.points_invalid) == 50
+
+
+BAD = {
+    "empty cloud": (np.zeros((0, 3)), np.eye(4), "cloud has no finite row among its 0"),
+    "NaN cloud": (np.full((7, 3), np.nan), np.eye(4), "cloud has no finite row among its 7"),
+    "NaN pose": (np.ones((2, 3)), np.full((4, 4), np.nan), "pose has values that are not finite"),
+    "scaled pose": (np.ones((2, 3)), np.diag([2.0, 2, 2, 1]), "pose is not rigid"),
+    "mirrored pose": (np.ones((2, 3)), np.diag([-1.0, 1, 1, 1]), "pose is not rigid"),
+    "bad last row": (np.ones((2, 3)), np.diag([1.0, 1, 1, 2]), "pose is not rigid"),
+    "flat cloud": (np.ones(6), np.eye(4), r"cloud has shape \(6,\), expected \(N, 3\)"),
+    "wide cloud": (np.ones((2, 4)), np.eye(4), r"cloud has shape \(2, 4\), expected \(N, 3\)"),
+    "small pose": (np.ones((2, 3)), np.eye(3), r"pose has shape \(3, 3\), expected \(4, 4\)"),
+}
+
+
+@pytest.mark.parametrize("cloud, pose, message", BAD.values(), ids=BAD.keys())
+def test_bad_input_raises_and_names_the_argument(room_map, cloud, pose, message):
+    before = jax.tree.map(jnp.copy, room_map)
+    with pytest.raises(ValueError, match=message):
+        hio.update(room_map, cloud, pose)
+    assert arrays_equal(before, room_map)
+
+
+@pytest.mark.parametrize(
+    "row, pose, flag",
+    [
+        (np.nan, np.eye(4), hio.Flag.EMPTY_CLOUD),
+        (1.0, np.full((4, 4), np.nan), hio.Flag.BAD_POSE),
+        (1.0, np.diag([2.0, 2, 2, 1]), hio.Flag.BAD_POSE),
+        (np.nan, np.diag([2.0, 2, 2, 1]), hio.Flag.BAD_POSE | hio.Flag.EMPTY_CLOUD),
+    ],
+)
+def test_bad_input_inside_jit_only_raises_a_sticky_flag(scanned, room_map, row, pose, flag):
+    clouds, poses = np.full((4, 250, 3), row, np.float32), np.stack([pose] * 4).astype(np.float32)
+    after, *_ = scanned(room_map, clouds, poses, jnp.zeros((5, 3)))
+    assert hio.Flag(int(after.report.flags)) == flag
+    flags = room_map.report.flags
+    assert arrays_equal(after.replace(report=after.report.replace(flags=flags)), room_map)
+    later = hio.update(after, *stream(1)[0])
+    assert hio.Flag(int(later.report.flags)) == flag
+
+
+def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty_map):
+    cloud = np.array([[3.0, 0.01, 0.01], [0.7, 0.01, 0.01]], np.float32)
+    state = hio.update(empty_map, cloud, np.eye(4))
+    assert int(state.report.points_outside) == 1
+    assert int(state.report.points_used) == 1
+    assert hio.Flag(int(state.report.flags)) == hio.Flag.POINTS_OUTSIDE
+    assert float(jnp.sum(state.grid.evidence.hits)) == 1
+    assert float(state.grid.evidence.passes[-1, 10, 8]) > 0
+    # A sensor that is far outside of the box with all its points must not harm the map either.
+    pose = np.eye(4)
+    pose[0, 3] = 50
+    far = hio.update(state, cloud, pose)
+    assert arrays_equal(far.grid.evidence.hits, state.grid.evidence.hits)
+    assert np.isfinite(np.asarray(hio.sdf(far, np.zeros((1, 3))))).all()
+
+
+def test_range_limits_are_counted(empty_map):
+    cloud = np.array([[0.01, 0, 0], [5.0, 0.0, 0], [0.5, 0, 0]], np.float32)
+    state = hio.update(empty_map, cloud, np.eye(4))
+    assert int(state.report.points_out_of_range) == 2
+    assert int(state.report.points_used) == 1
+    assert float(jnp.sum(state.grid.evidence.hits)) == 1
+
+
+def test_equivariance_to_moves_by_whole_voxels(room_map):
+    """The same stream in a box moved by whole voxels gives the same map, moved."""
+    move = np.array([3.0, -2.0, 1.0], np.float32)  # multiples of 0.1 m; exact in binary
+    moved = dataclasses.replace(
+        CONFIG, bounds=tuple(tuple(np.add(corner, move)) for corner in BOUNDS)
+    )
+    state = hio.init(moved, jax.random.key(0))
+    for cloud, pose in stream():
+        pose = pose.copy()
+        pose[:3, 3] += move
+        state = hio.update(state, cloud, pose)
+    assert np.mean(np.asarray(state.grid.evidence.hits != room_map.grid.evidence.hits)) < 0.01
+    points = np.random.default_rng(2).uniform(-0.5, 0.5, (200, 3)).astype(np.float32)
+    difference = hio.sdf(state, points + move) - hio.sdf(room_map, points)
+    assert float(jnp.mean(jnp.abs(difference))) < 0.02
+
+
+def test_snapshot_is_independent_of_a_donated_map(empty_map):
+    state = hio.update(empty_map, *stream(1)[0])
+    field = hio.snapshot(state)
+    points = np.zeros((3, 3))
+    before = hio.query(field, points)
+    assert arrays_equal(before, hio.query(state, points))
+    hio.update(state, *stream(1)[0], donate=True)
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(state))
+    assert arrays_equal(hio.query(field, points), before)
+    assert int(field.updates) == 1
+
+
+def test_grow_keeps_every_value(room_map):
+    grown = hio.grow(room_map, LARGER_BOUNDS)
+    points = np.random.default_rng(3).uniform(*BOUNDS, (400, 3)).astype(np.float32)
+    assert arrays_equal(hio.query(grown, points), hio.query(room_map, points))
+    assert grown.config.grid_shape == (33, 40, 23)
+    # The two share no memory: either can be donated.
+    donated = hio.update(room_map, *stream(1)[0])
+    beside = hio.grow(donated, LARGER_BOUNDS)
+    hio.update(donated, *stream(1)[0], donate=True)
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(beside))
+    # Mapping continues in the new part.
+    pose = np.eye(4)
+    pose[:3, 3] = [0, 2.0, 0]
+    for _ in range(3):
+        grown = hio.update(grown, np.array([[0.05, 0.55, 0.05]]), pose)
+    beyond = hio.query(grown, np.array([[0.0, 2.3, 0.0], [0.0, 2.9, 0.0]]))
+    assert np.asarray(beyond.observed).tolist() == [True, False]
+    with pytest.raises(ValueError, match=r"bounds is .*, expected a box that contains"):
+        hio.grow(room_map, ((-1, -1, -1), (3, 3, 3)))
+
+
+def test_a_grown_map_equals_one_of_that_size(empty_map):
+    """Distances across the old border are those of a map that had the larger box from the start."""
+    once = hio.init(dataclasses.replace(CONFIG, bounds=LARGER_BOUNDS), jax.random.key(0))
+    grown = hio.grow(empty_map, LARGER_BOUNDS)
+    for cloud, pose in stream(2):
+        once, grown = hio.update(once, cloud, pose), hio.update(grown, cloud, pose)
+    assert arrays_equal(once.grid, grown.grid)
+
+
+def test_init_and_queries_name_wrong_arguments(room_map):
+    with pytest.raises(ValueError, match="config is dict"):
+        hio.init({}, jax.random.key(0))
+    with pytest.raises(ValueError, match="key has dtype"):
+        hio.init(CONFIG, 0)
+    with pytest.raises(ValueError, match="state is NoneType"):
+        hio.update(None, np.ones((1, 3)), np.eye(4))
+    with pytest.raises(ValueError, match=r"points has shape \(2,\), expected \(..., 3\)"):
+        hio.sdf(room_map, np.zeros(2))
+    with pytest.raises(ValueError, match="field is int"):
+        hio.query(3, np.zeros(3))
+    with pytest.raises(ValueError, match="state is int"):
+        hio.save("nowhere", 3)
+    old_style = hio.init(CONFIG, jax.random.PRNGKey(0))
+    assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))
+
+
+def test_a_cloud_out_of_range_still_trains_on_the_grid(room_map):
+    """Its rays still clear space, and no flag is raised."""
+    for cloud in (np.full((50, 3), 30.0), np.zeros((4, 3))):
+        after = hio.update(room_map, cloud, np.eye(4))
+        assert int(after.report.flags) == int(room_map.report.flags)
+        assert np.isfinite(float(after.report.sdf_loss))
+        assert int(after.updates) == int(room_map.updates) + 1
+        assert not arrays_equal(after.network.params, room_map.network.params)
+    far = hio.update(room_map, np.full((50, 3), 30.0), np.eye(4))
+    index, _, _ = geometry.voxel_of(CONFIG, jnp.asarray([[0.3, 0.3, 0.3]]))
+    at = tuple(np.asarray(index)[0])
+    assert float(far.grid.evidence.passes[at]) > float(room_map.grid.evidence.passes[at])
+
+
+def test_an_empty_cloud_inside_jit_is_flagged():
+    # Short horizons: little to compile.
+    tiny = dataclasses.replace(CONFIG, distance_horizon=0.1, frontier_horizon=0.1)
+    state = hio.init(tiny, jax.random.key(0))
+    after = jax.jit(hio.update)(state, jnp.zeros((0, 3)), jnp.eye(4))
+    assert int(after.report.flags) & hio.Flag.EMPTY_CLOUD
+    assert arrays_equal(after.grid, state.grid)
+
+
+def test_a_fresh_state_can_be_donated():
+    state = hio.init(CONFIG, jax.random.key(5))
+    after = hio.update(state, *stream(1)[0], donate=True)
+    assert int(after.updates) == 1
+
+
+def test_donated_maps_equal_kept_ones(room_map, tmp_path):
+    path = tmp_path / "map.npz"
+    hio.save(path, room_map)
+    donated, kept = hio.load(path), room_map
+    baked = hio.bake(donated, 0.2)
+    for cloud, pose in stream(3):
+        before, donated = donated, hio.update(donated, cloud, pose, donate=True)
+        kept = hio.update(kept, cloud, pose)
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before))
+    assert arrays_equal(donated, kept)
+    assert int(donated.updates) == int(room_map.updates) + 3
+    assert arrays_equal(baked, hio.bake(room_map, 0.2))
+
+    with pytest.raises(ValueError, match="rigid"):
+        hio.update(donated, cloud, 2 * np.eye(4), donate=True)
+    again = hio.update(donated, cloud, pose, donate=True)
+    assert arrays_equal(again, hio.update(kept, cloud, pose))
+
+
+def test_donating_has_no_effect_inside_jit(empty_map):
+    arguments = (empty_map, *(jnp.asarray(array) for array in stream(1)[0]))
+    donating = jax.make_jaxpr(functools.partial(hio.update, donate=True))(*arguments)
+    assert str(donating) == str(jax.make_jaxpr(hio.update)(*arguments))
+
+
+def test_update_with_64_bit_numbers_enabled():
+    """Many controllers enable them before they import anything."""
+    code = (
+        "import jax; jax.config.update('jax_enable_x64', True)\n"
+        "import dataclasses, numpy as np, hiosdf_jax as hio\n"
+        "from hiosdf_jax._src.grid import geometry\n"
+        "from hiosdf_jax._src.network import tiles\n"
+        "from room import CONFIG, stream\n"
+        # Both windows around a cloud, and several tiles of the network's rows.
+        "config = dataclasses.replace(CONFIG, bounds=((-9, -1, -1), (9, 1, 1)), batches=1,\n"
+        "    max_range=2.0, near_samples=2000, distance_horizon=0.3, frontier_horizon=0.3)\n"
+        "count = config.near_samples + config.far_samples\n"
+        "assert tiles.tile_count(count) > 1\n"
+        "shapes = [geometry.window_shape(config, share * 2.0 + 1.2) for share in (0.5, 1)]\n"
+        "assert shapes[0] != shapes[1]\n"
+        "state = hio.update(hio.init(config, jax.random.key(0)), *stream(1)[0])\n"
+        "assert np.isfinite(hio.sdf_and_grad(state, np.zeros((5, 3)))[1]).all()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)
