@@ -8,34 +8,38 @@ import numpy as np
 from hiosdf_jax._src.state import Baked
 
 
-def baked(exact_sdf, low, high, resolution):
-    """Samples a distance function, (..., 3) m -> (...) m, on a lattice; all of it observed."""
+def baked(exact_sdf, low, high, resolution, frontier=None):
+    """Samples distances to surfaces and to unseen space on a lattice, functions (..., 3) -> (...).
+
+    Without `frontier` everything is observed.
+    """
     axes = [
         a + resolution * np.arange(round((b - a) / resolution) + 1)
         for a, b in zip(low, high, strict=True)
     ]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = jnp.array(exact_sdf(points), jnp.float32)
+    unseen = np.full(points.shape[:-1], 100) if frontier is None else frontier(points)
     return Baked(
         corner_world=jnp.array(low, jnp.float32),
         resolution=jnp.array(resolution, jnp.float32),
-        sdf=jnp.array(exact_sdf(points), jnp.float32),
-        frontier=jnp.full(points.shape[:-1], 100, jnp.float32),
-        lower=jnp.array(exact_sdf(points), jnp.float32),
+        sdf=values,
+        frontier=jnp.array(unseen, jnp.float32),
+        lower=values,
         updates=jnp.array(1, jnp.int32),
         stamp=jnp.array(0, jnp.float32),
     )
 
 
 def half_space(normal, offset, reach=8.0):
-    """What lies beyond a plane is solid: sdf = normal . p + offset, which trilinear maps hold
-    exactly, in eight samples."""
+    """A solid half space, sdf = normal . p + offset, which eight samples hold exactly."""
     return baked(
         lambda p: p @ np.asarray(normal, float) + offset, [-reach] * 3, [reach] * 3, 2 * reach
     )
 
 
 def half_spaces(count, seed=0, reach=2.0):
-    """Random ones: normals (count, 3), offsets (count,) and maps."""
+    """Random half spaces: normals (count, 3), offsets (count,) and maps."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -45,7 +49,7 @@ def half_spaces(count, seed=0, reach=2.0):
 
 
 def count_traces(function):
-    """The function, and a list that grows whenever it is traced."""
+    """Returns the function, and a list that grows whenever it is traced."""
     traces = []
 
     def counted(*args, **kwargs):
@@ -56,7 +60,7 @@ def count_traces(function):
 
 
 def _equations(jaxpr):
-    """All equations of a jaxpr and of those in it, each with what made the variables beside it."""
+    """All equations of a jaxpr and of those inside, each with the equations of its variables."""
     made = {}
     for equation in jaxpr.eqns:
         yield equation, made
@@ -70,7 +74,7 @@ def _equations(jaxpr):
 
 
 def _source(variable, made):
-    """The primitive that a variable is the result of, but for its shape."""
+    """The primitive that computes a variable, apart from changes of shape."""
     equation = made.get(id(variable))
     while equation is not None and equation.primitive.name in ("broadcast_in_dim", "reshape"):
         equation = made.get(id(equation.invars[0]))
@@ -78,10 +82,10 @@ def _source(variable, made):
 
 
 def equalities_with_least(function, *arguments):
-    """How often a function's derivative asks which of some floats equal their least or greatest.
+    """Counts where a function's derivative compares floats with their least or greatest.
 
-    A compiler that computes them twice, rounded in two ways, finds none: an H100 answered a tenth
-    of one map's points with the gradient 0.
+    A compiler that computes the floats twice, rounded in two ways, finds none equal: on an H100 a
+    tenth of one map's points got the gradient 0.
     """
 
     def derivative(*arguments):

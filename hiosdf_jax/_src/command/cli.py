@@ -70,7 +70,7 @@ def _demo(options: argparse.Namespace) -> None:
         options.output or _OUTPUT / "demo",
         name="demo",
         seed=options.seed,
-        truth=demo.ground_truth(stream),
+        truth=demo.sample_truth(stream),
         exact_sdf=lambda points_world: demo.signed_distance(stream.model, points_world)[0],
     )
 
