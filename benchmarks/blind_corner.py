@@ -1,10 +1,10 @@
-"""A robot that hurries around a corner behind which something stands, under both policies.
+"""A fast robot and an obstacle behind a corner, under both policies for unseen space.
 
     python benchmarks/blind_corner.py --seeds 100 --output blind_corner.json
 
-A goal lies around the corner of a corridor; a box stands in the part that cannot be seen from the
-start. The robot scans, maps and drives by MPPI, once taking unseen space for an obstacle and once
-believing what the network makes of it. Collisions are with the exact boxes.
+The goal is around the corner of a corridor. A box stands where it cannot be seen from the start.
+The robot scans, maps and drives by MPPI, once with unseen space as an obstacle and once with the
+network's prediction there. Collisions are with the exact boxes.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.demo import navigate
+from hiosdf_jax._src.demo.driver import Driver, head, make_driver, make_task
+from hiosdf_jax._src.demo.geodesic import lay_plane
+from hiosdf_jax._src.demo.robot import Robot, motion
 
 HEIGHT = 0.6  # m, of the corridor
-SENSOR_HEIGHT = 0.3  # m, of the robot's centre too
+SENSOR_HEIGHT = 0.3  # m, also of the robot's center
 BOUNDS = ((-0.1, -0.1, -0.1), (4.9, 5.5, 0.7))
-ROBOT = navigate.Robot(
+ROBOT = Robot(
     heights=(SENSOR_HEIGHT,), max_speed=2.0, max_acceleration=2.0, max_turn_rate=2.0, step=0.1
 )
 SENSE_EVERY = 10  # control steps
@@ -37,7 +39,7 @@ NOISE = 0.01  # m, standard deviation of a range
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Boxes (B, 2, 3) m as (low, high) corners, solid; where to start and where to go, (2,) m."""
+    """Solid boxes (B, 2, 3) m as (low, high) corners; start and goal, (2,) m."""
 
     boxes: np.ndarray
     start: np.ndarray
@@ -45,17 +47,17 @@ class Scene:
 
 
 def draw_scene(seed: int) -> Scene:
-    """A corridor along x that turns to the left, and a box close behind the inner corner."""
+    """Draws a corridor along x that turns left, with a box close behind the inner corner."""
     rng = np.random.default_rng(seed)
     width = rng.uniform(1.3, 1.7)
     corner = rng.uniform(2.6, 3.0)  # x of the inner corner; its y is the width
     end = rng.uniform(4.6, 5.2)  # y of the far end
     far, high = corner + width, HEIGHT
-    gap = 0.7  # m that the box leaves, for a robot of 0.4 m
+    gap = 0.7  # m between box and wall, for a robot of 0.4 m
     size = rng.uniform([0.3, 0.2], [width - gap, 0.5])
     offset = rng.uniform(0.0, 0.5)
     y = width + offset
-    # Most boxes lean on the inner wall, where they cannot be seen; some on the outer one.
+    # Most boxes stand at the inner wall, where they cannot be seen, some at the outer one.
     x = corner if rng.uniform() < 0.8 else far - size[0]
     thick = 0.2
     solid = [
@@ -74,15 +76,15 @@ def draw_scene(seed: int) -> Scene:
 
 
 def exact_sdf(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance (N,) m of points (N, 3) m to boxes; inside of one, not positive."""
-    centre, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
-    beyond = np.abs(points[:, None] - centre) - half
+    """Computes the distance (N,) m of points (N, 3) m to boxes; inside of a box it is <= 0."""
+    center, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
+    beyond = np.abs(points[:, None] - center) - half
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=-1)
     return (outside + np.minimum(beyond.max(axis=-1), 0)).min(axis=1)
 
 
 def cast(boxes: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Range (N,) m to the first box along unit directions (N, 3); inf for none."""
+    """Casts rays along unit directions (N, 3); returns ranges (N,) m, inf without a hit."""
     with np.errstate(divide="ignore"):
         inverse = 1 / directions[:, None]
     to_faces = (boxes.transpose(1, 0, 2)[:, None] - origin) * inverse  # (2, N, B, 3)
@@ -92,7 +94,7 @@ def cast(boxes: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> np.nd
 
 
 def lidar_directions(columns: int = 180, rows: int = 25) -> np.ndarray:
-    """Unit vectors all around, (N, 3), up to 85 degrees off the horizon and densest at it."""
+    """Returns unit vectors (N, 3), up to 85 degrees off the horizon and densest at it."""
     slope = np.linspace(-1, 1, rows)
     azimuth, elevation = np.meshgrid(
         np.linspace(-np.pi, np.pi, columns, endpoint=False) + 1e-3,
@@ -104,7 +106,7 @@ def lidar_directions(columns: int = 180, rows: int = 25) -> np.ndarray:
 
 
 def map_config() -> hio.Config:
-    """A small map: the corridor is some 20,000 voxels."""
+    """Returns the configuration of a small map, about 20,000 voxels."""
     return hio.Config.light(
         BOUNDS,
         max_range=MAX_RANGE,
@@ -119,12 +121,12 @@ def map_config() -> hio.Config:
     )
 
 
-def run(scene: Scene, seed: int, unknown: str, driver: navigate.Driver) -> dict[str, object]:
+def run(scene: Scene, seed: int, unknown: str, driver: Driver) -> dict[str, object]:
     """Drives to the goal once."""
     rng = np.random.default_rng((seed, 1))
     directions = lidar_directions()
-    plane = navigate.lay_plane(BOUNDS, 0.1)
-    field = hio.init(map_config(), jax.random.key(seed))
+    plane = lay_plane(BOUNDS, 0.1)
+    map_state = hio.init(map_config(), jax.random.key(seed))
     state = jnp.array([*scene.start, 0.0, 0.0, 0.0])
     plan, states = driver.plan, [np.asarray(state)[None]]
     steps = int(TIME_LIMIT / ROBOT.step)
@@ -142,19 +144,18 @@ def run(scene: Scene, seed: int, unknown: str, driver: navigate.Driver) -> dict[
             ranges = cast(scene.boxes, pose[:3, 3], directions @ pose[:3, :3].T)
             ranges += NOISE * rng.normal(size=len(ranges))
             cloud = np.where(ranges < MAX_RANGE, ranges, np.nan)[:, None] * directions
-            field = hio.update(field, cloud, pose)
-            served = hio.snapshot(field)
-            task, path_from, _ = navigate.make_task(ROBOT, served, plane, scene.goal)
-        task = navigate.head(task, path_from, np.array([x, y]))
+            map_state = hio.update(map_state, cloud, pose)
+            task, path_from, _ = make_task(ROBOT, hio.snapshot(map_state), plane, scene.goal)
+        task = head(task, path_from, np.array([x, y]))
         control, plan, _ = driver.step(plan, state, task)
-        passed = navigate.motion(ROBOT, state, control)
+        passed = motion(ROBOT, state, control)
         states.append(np.asarray(passed))
         state = passed[-1]
         if np.hypot(*(np.asarray(state[:2]) - scene.goal)) < REACHED:
             break
     path = np.concatenate(states)
-    centres = np.column_stack([path[:, :2], np.full(len(path), SENSOR_HEIGHT)])
-    least = float(exact_sdf(scene.boxes, centres).min() - ROBOT.radius)
+    centers = np.column_stack([path[:, :2], np.full(len(path), SENSOR_HEIGHT)])
+    least = float(exact_sdf(scene.boxes, centers).min() - ROBOT.radius)
     return {
         "seed": seed,
         "unknown": unknown,
@@ -165,8 +166,8 @@ def run(scene: Scene, seed: int, unknown: str, driver: navigate.Driver) -> dict[
     }
 
 
-def summarise(runs: list[dict]) -> dict[str, object]:
-    """Counts over the runs of one policy."""
+def summarize(runs: list[dict]) -> dict[str, object]:
+    """Counts outcomes over the runs of one policy."""
     return {
         "runs": len(runs),
         "collided": sum(r["collided"] for r in runs),
@@ -177,16 +178,16 @@ def summarise(runs: list[dict]) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Blind corner.")
+    parser = argparse.ArgumentParser(description="A blind corner under both policies.")
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
     result = {}
     for unknown in ("obstacle", "network"):
-        driver = navigate.make_driver(ROBOT, unknown, jax.random.key(0), horizon=20)
+        driver = make_driver(ROBOT, unknown, jax.random.key(0), horizon=20)
         begin = time.perf_counter()
         runs = [run(draw_scene(s), s, unknown, driver) for s in range(options.seeds)]
-        result[unknown] = summarise(runs) | {
+        result[unknown] = summarize(runs) | {
             "wall_s": time.perf_counter() - begin,
             "collided_seeds": [r["seed"] for r in runs if r["collided"]],
             "not_reached_seeds": [r["seed"] for r in runs if not r["reached"]],

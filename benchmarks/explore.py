@@ -1,9 +1,9 @@
-"""The exploring robot over many seeds, each in a process of its own.
+"""Runs the exploring robot over many seeds, each in its own process.
 
     python benchmarks/explore.py --seeds 20 --output explore.json
 
-Counts goals reached and collisions, and takes the wall time of the whole command, start-up and
-compilation and drawing included.
+It counts reached goals and collisions, and measures the wall time of the whole command, including
+start, compilation and drawing.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def run(seed: int, folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text("utf-8")) | {"command_s": seconds}
 
 
-def summarise(runs: list[dict]) -> dict:
-    """Counts and extremes over runs."""
+def summarize(runs: list[dict]) -> dict:
+    """Counts outcomes and extremes over runs."""
     return {
         "runs": len(runs),
         "reached": sum(r["reached"] for r in runs),
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--output", type=Path)
-    parser.add_argument("--folder", type=Path, help="keep pictures and metrics here")
+    parser.add_argument("--folder", type=Path, help="folder to keep pictures and metrics in")
     options = parser.parse_args()
     runs = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -56,7 +56,7 @@ def main() -> None:
             runs.append(run(seed, (options.folder or Path(scratch)) / f"seed_{seed}"))
             shown = ("seed", "from", "to", "reached", "collided", "least_clearance_m", "path_m")
             print({key: runs[-1][key] for key in (*shown, "command_s")}, flush=True)
-    summary = summarise(runs)
+    summary = summarize(runs)
     print(json.dumps(summary))
     if options.output:
         options.output.write_text(json.dumps(summary | {"each": runs}, indent=2) + "\n", "utf-8")

@@ -1,11 +1,11 @@
-"""A built-in world with exact distances: an apartment and a depth camera carried through it."""
+"""A built-in world with exact distances: a depth camera carried through an apartment."""
 
 from hiosdf_jax._src.demo.apartment import (
     BOUNDS_WORLD,
     ApartmentStream,
     camera_path,
-    ground_truth,
     load_model,
+    sample_truth,
 )
 from hiosdf_jax._src.demo.primitives import signed_distance
 
@@ -13,7 +13,7 @@ __all__ = [
     "BOUNDS_WORLD",
     "ApartmentStream",
     "camera_path",
-    "ground_truth",
     "load_model",
+    "sample_truth",
     "signed_distance",
 ]

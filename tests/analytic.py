@@ -8,19 +8,24 @@ import numpy as np
 from hiosdf_jax._src.state import Baked
 
 
-def baked(exact_sdf, low, high, resolution):
-    """Samples a distance function, (..., 3) m -> (...) m, on a lattice; all of it observed."""
+def baked(exact_sdf, low, high, resolution, frontier=None):
+    """Samples distances to surfaces and to unseen space on a lattice, functions (..., 3) -> (...).
+
+    Without `frontier` everything is observed.
+    """
     axes = [
         a + resolution * np.arange(round((b - a) / resolution) + 1)
         for a, b in zip(low, high, strict=True)
     ]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = jnp.array(exact_sdf(points), jnp.float32)
+    unseen = np.full(points.shape[:-1], 100) if frontier is None else frontier(points)
     return Baked(
         corner_world=jnp.array(low, jnp.float32),
         resolution=jnp.array(resolution, jnp.float32),
-        sdf=jnp.array(exact_sdf(points), jnp.float32),
-        frontier=jnp.full(points.shape[:-1], 100, jnp.float32),
-        lower=jnp.array(exact_sdf(points), jnp.float32),
+        sdf=values,
+        frontier=jnp.array(unseen, jnp.float32),
+        lower=values,
         updates=jnp.array(1, jnp.int32),
         stamp=jnp.array(0, jnp.float32),
     )

@@ -1,4 +1,4 @@
-"""The benchmark of the blind corner: its ray caster, its scenes, and one run of it."""
+"""The blind-corner benchmark: its ray caster, its scenes, and one run."""
 
 import importlib.util
 from pathlib import Path
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
-from hiosdf_jax._src.demo import navigate
+from hiosdf_jax._src.demo.driver import make_driver
+from hiosdf_jax._src.demo.sensing import map_config
 
 FILE = Path(__file__).parents[1] / "benchmarks" / "blind_corner.py"
 
@@ -18,7 +19,7 @@ def corner():
     spec = importlib.util.spec_from_file_location("blind_corner", FILE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # A dataclass looks its module up.
+    # A dataclass looks up its module.
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(__import__("sys").modules, "blind_corner", module)
         spec.loader.exec_module(module)
@@ -33,7 +34,7 @@ def test_distances_to_boxes_by_hand(corner):
 
 
 def test_rays_end_at_the_first_surface(corner):
-    """Sphere tracing down the exact distance is the independent caster."""
+    """Checked against sphere tracing, an independent caster."""
     scene = corner.draw_scene(0)
     origin = np.array([*scene.start, corner.SENSOR_HEIGHT])
     directions = corner.lidar_directions()[::37]
@@ -44,28 +45,32 @@ def test_rays_end_at_the_first_surface(corner):
     np.testing.assert_allclose(ranges, traced, atol=1e-3)
 
 
-def test_scenes_hide_the_box_and_leave_a_way(corner):
+def test_scenes_hide_the_box_and_leave_a_path(corner):
     for seed in range(100):
         scene = corner.draw_scene(seed)
         height = corner.SENSOR_HEIGHT
         for xy in (scene.start, scene.goal):
             gap = corner.exact_sdf(scene.boxes, np.array([[*xy, height]]))[0]
             assert gap > corner.ROBOT.radius + 0.05
-        # From the start no ray meets the last box, which is the one behind the corner.
+        # From the start no ray hits the last box, the one behind the corner.
         origin, last = np.array([*scene.start, height]), len(scene.boxes) - 1
         without = corner.cast(scene.boxes[:last], origin, corner.lidar_directions())
         with_it = corner.cast(scene.boxes, origin, corner.lidar_directions())
         assert (with_it < without - 1e-9).mean() < 0.01
-        # Beside the box there is room for the robot and its margin.
+        # The robot and its margin fit beside the box.
         (low, high), inner = scene.boxes[last], scene.boxes[5, 1, 0]
         far = scene.boxes[4, 0, 0]
         room = max(low[0] - inner, far - high[0])
         assert room >= 2 * (corner.ROBOT.radius + corner.ROBOT.margin) + 0.1
 
 
-def test_taking_unseen_space_for_an_obstacle_the_robot_gets_around_a_corner(corner):
-    # With seed 3 the robot that believes the network hits the box.
-    driver = navigate.make_driver(corner.ROBOT, "obstacle", jax.random.key(0), horizon=20)
+def test_with_unseen_space_as_an_obstacle_the_robot_gets_around_the_corner(corner, monkeypatch):
+    # The corridor fits into the exploring robot's map, whose update other tests compile too.
+    (low, high), (inner_low, inner_high) = map_config().bounds, corner.map_config().bounds
+    assert np.less_equal(low, inner_low).all() and np.less_equal(inner_high, high).all()
+    monkeypatch.setattr(corner, "map_config", map_config)
+    # With seed 3 and the network's prediction the robot hits the box.
+    driver = make_driver(corner.ROBOT, "obstacle", jax.random.key(0), horizon=20)
     run = corner.run(corner.draw_scene(3), 3, "obstacle", driver)
     assert run["reached"] and not run["collided"]
     assert run["least_clearance_m"] > 0.02

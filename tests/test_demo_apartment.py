@@ -1,4 +1,4 @@
-"""The built-in apartment, the camera that is carried through it, and its ground truth."""
+"""The built-in apartment, its camera path and stream, and the sampled truth."""
 
 import numpy as np
 import pytest
@@ -10,12 +10,12 @@ from hiosdf_jax.demo import (
     BOUNDS_WORLD,
     ApartmentStream,
     camera_path,
-    ground_truth,
     load_model,
+    sample_truth,
     signed_distance,
 )
 
-ROOMS = {  # x0, x1, y0, y1 in metres
+ROOMS = {  # x0, x1, y0, y1 in m
     "living": (0, 5.6, 0, 4.4),
     "kitchen": (5.7, 10, 0, 4.4),
     "hall": (7.5, 10, 4.5, 8),
@@ -42,7 +42,7 @@ def noisy():
 
 @pytest.fixture(scope="module")
 def truth(clean):
-    return ground_truth(clean, count=5000)
+    return sample_truth(clean, count=5000)
 
 
 def in_room(points, room):
@@ -53,6 +53,14 @@ def in_room(points, room):
 
 def to_world(cloud, pose):
     return cloud.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def exact_surface(stream, index):
+    return stream.camera.exact_surface(stream.poses_world_sensor[index])
+
+
+def exact_depth(stream, index):
+    return stream.camera.exact_depth(stream.poses_world_sensor[index])
 
 
 def body_name(model, geom):
@@ -70,12 +78,12 @@ def test_it_is_furnished(model):
     assert {"sofa", "bed", "dining_table", "fridge", "wardrobe", "desk"} <= set(furniture)
 
 
-def test_nothing_moves_and_all_geoms_have_an_exact_distance(model):
+def test_the_model_is_static_and_all_geoms_have_an_exact_distance(model):
     assert model.nv == 0
-    signed_distance(model, np.zeros((1, 3)))  # refuses any other geom
+    signed_distance(model, np.zeros((1, 3)))  # raises for any other type of geom
 
 
-def test_thin_parts_and_no_others_are_named_so(model):
+def test_exactly_the_thin_parts_are_named_thin(model):
     thin = 0
     for geom in range(model.ngeom):
         kind = mujoco.mjtGeom(int(model.geom_type[geom]))
@@ -103,7 +111,7 @@ def test_nothing_floats_and_no_furniture_interpenetrates(model):
     assert parts == 1, floating
 
 
-def test_bounds_hold_the_walls(model):
+def test_bounds_contain_the_walls(model):
     low, high = np.array(BOUNDS_WORLD)
     points = np.random.default_rng(0).uniform(low, high, (600, 3))
     for axis in range(3):
@@ -130,7 +138,7 @@ def test_doorways_are_open_below_their_lintels(model):
 def test_path_keeps_clear_of_everything(model):
     path = camera_path(1000)[:, :3, 3]
     assert signed_distance(model, path)[0].min() >= 0.3
-    for height in (0.4, 0.8):  # nobody walks through a table to carry a camera over it
+    for height in (0.4, 0.8):  # the person below the camera cannot walk through a table
         below = path * [1, 1, 0] + [0, 0, height]
         assert signed_distance(model, below)[0].min() >= 0.3
 
@@ -169,7 +177,7 @@ def test_path_does_not_depend_on_the_number_of_frames():
 
 def test_returns_lie_on_the_exact_surface_without_noise(clean):
     for index in range(0, len(clean), 4):
-        exact = clean.exact_surface(index)
+        exact = exact_surface(clean, index)[0]
         assert np.abs(signed_distance(clean.model, exact)[0]).max() < 1e-6
         cloud, pose = clean[index]
         seen = np.isfinite(cloud).all(axis=1)
@@ -178,14 +186,14 @@ def test_returns_lie_on_the_exact_surface_without_noise(clean):
 
 def test_rays_stop_at_the_first_surface(clean):
     for index in (3, 20, 33):
-        exact = clean.exact_surface(index)
+        exact = exact_surface(clean, index)[0]
         origin = clean.poses_world_sensor[index, :3, 3]
         for share in (0.25, 0.5, 0.9):
             sdf, _ = signed_distance(clean.model, origin + share * (exact - origin))
             assert (sdf > 0).all()
 
 
-def test_frames_have_the_shape_and_type_of_the_contract(noisy):
+def test_frames_have_the_documented_shape_and_dtype(noisy):
     cloud, pose = noisy[0]
     assert cloud.shape == (160 * 120, 3) and cloud.dtype == np.float32
     assert pose.shape == (4, 4) and pose.dtype == np.float32
@@ -196,7 +204,7 @@ def test_frames_have_the_shape_and_type_of_the_contract(noisy):
 def test_field_of_view_is_90_degrees(clean):
     cloud, _ = clean[0]
     image = cloud.reshape(60, 80, 3)
-    # Centres of the outermost pixels lie half a pixel inside.
+    # Centers of the outermost pixels lie half a pixel inside.
     for column, x_over_z in ((0, -39.5 / 40), (-1, 39.5 / 40)):
         edge = image[:, column]
         np.testing.assert_allclose(edge[:, 0] / edge[:, 2], x_over_z, rtol=1e-5)
@@ -204,17 +212,17 @@ def test_field_of_view_is_90_degrees(clean):
     np.testing.assert_allclose(bottom[:, 1] / bottom[:, 2], 29.5 / 40, rtol=1e-5)
 
 
-def test_nothing_returns_from_beyond_the_limits_of_range():
+def test_returns_are_within_the_limits_of_range():
     stream = ApartmentStream(frames=20, width=40, height=30, max_range=2.0)
     for cloud, _ in stream:
         ranges = np.linalg.norm(cloud[np.isfinite(cloud[:, 0])], axis=1)
         assert ranges.min() >= 0.3 - 1e-6 and ranges.max() <= 2 + 1e-6
     short = sum(np.isnan(cloud[:, 0]).sum() for cloud, _ in stream)
-    assert short > 0.1 * 20 * 40 * 30  # much of the apartment is farther away
+    assert short > 0.1 * 20 * 40 * 30  # most of the apartment is farther away
 
 
 def test_noise_follows_its_formula(noisy):
-    exact = np.concatenate([noisy.exact_depth(i) for i in range(0, 40, 2)])
+    exact = np.concatenate([exact_depth(noisy, i) for i in range(0, 40, 2)])
     cloud = np.concatenate([noisy[i][0] for i in range(0, 40, 2)])
     error, sigma = cloud[:, 2] - exact, 0.0012 + 0.0019 * (exact - 0.4) ** 2
     usable = np.linalg.norm(cloud, axis=1) < 5.5  # neither NaN nor cut at the limit
@@ -236,7 +244,7 @@ def test_noise_moves_points_along_their_rays(noisy):
 
 
 def test_some_pixels_drop_out(noisy):
-    near = np.concatenate([noisy.exact_depth(i) for i in range(40)]) < 3  # surely within range
+    near = np.concatenate([exact_depth(noisy, i) for i in range(40)]) < 3  # always within range
     missing = np.concatenate([np.isnan(noisy[i][0][:, 0]) for i in range(40)])
     assert missing[near].mean() == pytest.approx(0.005, abs=0.0007)
 
@@ -244,7 +252,7 @@ def test_some_pixels_drop_out(noisy):
 def test_flying_pixels_lie_between_foreground_and_background(noisy):
     count = 0
     for index in range(0, 40, 8):
-        exact = noisy.exact_depth(index).reshape(120, 160)
+        exact = exact_depth(noisy, index).reshape(120, 160)
         depth = noisy[index][0][:, 2].reshape(120, 160)
         sigma = 0.0012 + 0.0019 * (exact - 0.4) ** 2
         padded = np.pad(exact, 1, mode="edge")
@@ -268,7 +276,7 @@ def test_frames_depend_on_arguments_and_index_only(noisy):
 
 
 def test_frames_do_not_share_their_noise(noisy):
-    near = (noisy.exact_depth(0) < 3) & (noisy.exact_depth(1) < 3)
+    near = (exact_depth(noisy, 0) < 3) & (exact_depth(noisy, 1) < 3)
     dropped = [np.isnan(noisy[index][0][:, 0]) & near for index in (0, 1)]
     assert dropped[0].sum() > 10
     assert (dropped[0] & dropped[1]).sum() < 0.2 * dropped[0].sum()
@@ -292,10 +300,10 @@ def test_bad_arguments_are_named(arguments, match):
         ApartmentStream(**arguments)
 
 
-# --- the ground truth ---
+# --- the truth ---
 
 
-def test_ground_truth_has_its_shapes_and_is_exact(clean, truth):
+def test_truth_has_the_documented_shapes_and_is_exact(clean, truth):
     assert truth.points_world.shape == (5000, 3) and truth.surface_points_world.shape == (5000, 3)
     assert [field.dtype.name for field in truth] == ["float32"] * 3 + [
         "int32",
@@ -316,15 +324,14 @@ def test_thin_points_are_seen_and_on_thin_parts(clean, truth):
     seen = np.zeros(model.ngeom, int)
     everything = []
     for index in range(len(clean)):
-        points, geoms = clean.exact_parts(index)
-        np.testing.assert_array_equal(points, clean.exact_surface(index))
+        points, geoms = exact_surface(clean, index)
         seen += np.bincount(geoms, minlength=model.ngeom)
         everything.append(points)
     expected = sum(min(seen[i], 50) for i in thin if seen[i] >= 10)
     assert 1000 < expected == len(truth.thin_points_world)
     exact = {*map(bytes, np.concatenate(everything).astype(np.float32))}
     assert all(bytes(point) in exact for point in truth.thin_points_world)
-    # The nearest geom to where a ray ended is the one that it met, unless another touches it there.
+    # A ray ends on the geom that it hit.
     distance = np.stack([_distance_to(model, i, truth.thin_points_world) for i in thin])
     assert np.abs(distance).min(axis=0).max() < 1e-5
 
@@ -338,32 +345,32 @@ def _distance_to(model, geom, points):
     return primitives._PRIMITIVES[int(model.geom_type[geom])][0](local, model.geom_size[geom])
 
 
-def test_ground_truth_was_seen_free_in_its_frame(clean, truth):
+def test_truth_points_are_free_in_their_frame(clean, truth):
     assert truth.frame.min() == 0 and truth.frame.max() == len(clean) - 1
     for index in range(len(clean)):
         pose = clean.poses_world_sensor[index]
         local = (truth.points_world[truth.frame == index] - pose[:3, 3]) @ pose[:3, :3]
         ahead = local[local[:, 2] > 0.05]  # nearer, rounding blurs the pixel
         column, row = (ahead[:, :2] / ahead[:, 2:] * 40 + [40, 30]).astype(int).T
-        assert (ahead[:, 2] <= clean.exact_depth(index)[row * 80 + column] + 1e-5).all()
+        assert (ahead[:, 2] <= exact_depth(clean, index)[row * 80 + column] + 1e-5).all()
 
 
-def test_ground_truth_covers_all_rooms(truth):
+def test_truth_covers_all_rooms(truth):
     for points in (truth.points_world, truth.surface_points_world):
         for room in ROOMS:
             assert in_room(points, room).mean() > 0.03, room
 
 
-def test_ground_truth_depends_on_its_seed_only(clean, truth):
-    again = ground_truth(clean, count=5000)
+def test_truth_depends_on_its_seed_only(clean, truth):
+    again = sample_truth(clean, count=5000)
     noisy = ApartmentStream(frames=40, width=80, height=60)
-    for other in (again, ground_truth(noisy, count=5000)):
+    for other in (again, sample_truth(noisy, count=5000)):
         for got, expected in zip(other, truth, strict=True):
             np.testing.assert_array_equal(got, expected)
-    assert not np.array_equal(ground_truth(clean, 5000, seed=2).points_world, truth.points_world)
+    assert not np.array_equal(sample_truth(clean, 5000, seed=2).points_world, truth.points_world)
 
 
-def test_ground_truth_names_a_frame_that_sees_nothing():
+def test_truth_refuses_a_frame_that_sees_nothing():
     blind = ApartmentStream(frames=2, width=8, height=6, max_range=0.31)
     with pytest.raises(ValueError, match=r"frame 0 sees no surface within 0\.31 m"):
-        ground_truth(blind, count=10)
+        sample_truth(blind, count=10)

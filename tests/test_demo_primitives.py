@@ -1,4 +1,4 @@
-"""Distances to primitives, against dense samples of their surfaces and MuJoCo's own solver."""
+"""Distances to primitives, against dense surface samples and MuJoCo's own solver."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def compile_model(*geoms):
 
 
 def rotated(kind):
-    """A geom of this kind whose frame lies at POSITION, ROTATION."""
+    """A geom of this kind with its frame at POSITION, ROTATION."""
     quat = ROTATION.as_quat(scalar_first=True)
     text = {"pos": POSITION, "quat": quat, "size": SIZES[kind]}
     attributes = " ".join(f'{k}="{" ".join(map(repr, map(float, v)))}"' for k, v in text.items())
@@ -40,7 +40,7 @@ def random_points(count=2000):
 
 
 def sample_surface(kind, n=200):
-    """Points on the surface in the frame of the geom, at most about 5 mm apart."""
+    """Points on the surface, geom frame, at most about 5 mm apart."""
     size = SIZES[kind]
     unit, angle = np.linspace(-1, 1, n), np.linspace(0, 2 * np.pi, 2 * n)
 
@@ -89,7 +89,7 @@ def is_inside(kind, p):
 
 
 @KINDS
-def test_distance_is_that_to_dense_samples_of_the_surface(kind):
+def test_distance_equals_that_to_dense_surface_samples(kind):
     points = random_points()
     sdf, _ = signed_distance(compile_model(rotated(kind)), points)
     local = ROTATION.inv().apply(points - POSITION)
@@ -102,7 +102,7 @@ def test_distance_is_that_to_dense_samples_of_the_surface(kind):
 
 
 @KINDS
-def test_distance_is_mujocos_own(kind):
+def test_distance_equals_mujocos(kind):
     radius = 0.01
     probe = f'<body mocap="true"><geom name="probe" type="sphere" size="{radius}"/></body>'
     model = compile_model(rotated(kind), probe)
@@ -121,7 +121,7 @@ def test_distance_is_mujocos_own(kind):
 
 
 @KINDS
-def test_gradient_is_that_of_finite_differences(kind):
+def test_gradient_equals_finite_differences(kind):
     model, points, h = compile_model(rotated(kind)), random_points(), 1e-6
     _, grad = signed_distance(model, points)
     differences = np.stack(
@@ -145,7 +145,7 @@ def test_a_step_against_the_gradient_leads_to_the_surface(kind):
 
 
 @KINDS
-def test_points_of_symmetry_and_of_the_surface_get_unit_gradients(kind):
+def test_gradients_have_unit_length_on_planes_of_symmetry_and_surfaces(kind):
     size = (*SIZES[kind], 0, 0)[:3]
     axes = np.concatenate([np.zeros((1, 3)), np.diag(size), -np.diag(size)])
     corners = np.array(np.meshgrid(*[(-s, s) for s in size])).reshape(3, -1).T
@@ -154,13 +154,13 @@ def test_points_of_symmetry_and_of_the_surface_get_unit_gradients(kind):
     sdf, grad = signed_distance(model, ROTATION.apply(local))
     assert np.isfinite(sdf).all()
     np.testing.assert_allclose(np.linalg.norm(grad, axis=1), 1, atol=1e-12)
-    # ... and without a rotation, whose rounding would move a point off the tie.
+    # Without a rotation, whose rounding would break the ties.
     still = compile_model(f'<geom type="{kind}" size="{" ".join(map(str, SIZES[kind]))}"/>')
     _, grad = signed_distance(still, local)
     np.testing.assert_allclose(np.linalg.norm(grad, axis=1), 1, atol=1e-12)
 
 
-def test_union_is_the_minimum_with_the_gradient_of_the_winner():
+def test_union_is_the_minimum_with_the_nearest_geoms_gradient():
     geoms = [
         '<geom type="box" size="0.2 0.2 0.2" pos="-0.1 0 0"/>',
         '<geom type="sphere" size="0.3" pos="0.3 0 0"/>',
@@ -175,7 +175,7 @@ def test_union_is_the_minimum_with_the_gradient_of_the_winner():
 
 
 def test_depth_inside_overlapping_solids_is_never_exaggerated():
-    # Two cubes that make one box of 4 x 2 x 2 and share a slab: its true depth is known.
+    # Two boxes that overlap in a slab and make one box of 4 x 2 x 2, whose exact depth is known.
     halves = ['<geom type="box" size="1.1 1 1" pos="-0.9 0 0"/>']
     halves.append('<geom type="box" size="1.1 1 1" pos="0.9 0 0"/>')
     points = np.random.default_rng(2).uniform(-1, 1, (500, 3)) * [2, 1, 1]
@@ -196,7 +196,7 @@ def test_bodies_carry_their_geoms():
         np.testing.assert_allclose(got, expected, atol=1e-12)
 
 
-def test_chunks_do_not_show(monkeypatch):
+def test_the_chunk_size_changes_nothing(monkeypatch):
     model, points = compile_model(*map(rotated, SIZES)), random_points(1000)
     whole = signed_distance(model, points)
     monkeypatch.setattr(primitives, "_CHUNK", 64)

@@ -44,7 +44,7 @@ def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
         from hiosdf_jax import demo
 
         whole = demo.ApartmentStream()
-        truth = demo.ground_truth(whole)
+        truth = demo.sample_truth(whole)
     else:
         whole = datasets.NpzStream(folder / f"{name}.npz")
         truth = datasets.read_truth(folder / f"{name}.npz")

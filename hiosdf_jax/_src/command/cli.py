@@ -108,7 +108,7 @@ def _demo(options: argparse.Namespace) -> None:
         options.output or _OUTPUT / "demo",
         name="demo",
         seed=options.seed,
-        truth=apartment.ground_truth(stream),
+        truth=apartment.sample_truth(stream),
         exact_sdf=lambda points_world: signed_distance(stream.model, points_world)[0],
     )
 

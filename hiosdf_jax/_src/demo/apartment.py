@@ -1,4 +1,4 @@
-"""A furnished apartment, a depth camera carried through it, and the exact distances it saw."""
+"""A furnished apartment, a depth camera carried through it, and exact distances where it saw."""
 
 # mujoco's bindings carry no types that pyright can see.
 # pyright: reportAttributeAccessIssue=false
@@ -17,7 +17,7 @@ from hiosdf_jax._src.demo.primitives import signed_distance
 BOUNDS_WORLD = ((-0.2, -0.2, -0.2), (10.2, 8.2, 2.8))  # m
 
 _CAMERA_HEIGHT = 1.2  # m
-_PITCH = np.radians(12)  # downwards: furniture is low
+_PITCH = np.radians(12)  # downward: furniture is low
 # x (m), y (m), and the gaze relative to the direction of travel (degrees, positive to the left).
 _WAYPOINTS = np.array(
     [
@@ -67,26 +67,26 @@ _WAYPOINTS = np.array(
 
 
 def load_model() -> mujoco.MjModel:
-    """Loads the apartment: about 290 boxes, spheres, capsules and cylinders, none of which moves.
+    """Loads the apartment: about 290 static boxes, spheres, capsules and cylinders.
 
     Returns:
-      The model; metres, z up. Geoms less than 5 cm thick have names that begin with "thin_".
+        The model, in m, z up. The names of geoms less than 5 cm thick start with "thin_".
     """
     xml = resources.files("hiosdf_jax._src.demo").joinpath("apartment.xml").read_text("utf-8")
     return mujoco.MjModel.from_xml_string(xml)
 
 
 def camera_path(frames: int) -> np.ndarray:
-    """Lays a smooth path through all rooms, on which no obstacle is nearer than 0.3 m.
+    """Lays a smooth path of 25.5 m through all rooms, at least 0.3 m from every obstacle.
 
     Args:
-      frames: how many poses, >= 1, of a path of 25.5 m; they lie closer where the camera turns.
+        frames: Number of poses, >= 1; they lie closer where the camera turns.
 
     Returns:
-      (frames, 4, 4) float64 T_world_sensor, metres; optical frame (x right, y down, z forward).
+        (frames, 4, 4) float64 T_world_sensor, m; optical frame (x right, y down, z forward).
 
     Raises:
-      ValueError: frames < 1.
+        ValueError: `frames` < 1.
     """
     if frames < 1:
         raise ValueError(f"frames = {frames}, expected >= 1")
@@ -98,7 +98,7 @@ def camera_path(frames: int) -> np.ndarray:
     dense = np.linspace(0, knots[-1], 8001)
     xy, velocity = position(dense), position(dense, 1)
     yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0])) + np.radians(gaze(dense))
-    # Whoever carries a camera slows down to turn: frames are even in metres plus radians.
+    # A person who carries a camera slows down to turn: frames are even in meters plus radians.
     steps = np.linalg.norm(np.diff(xy, axis=0), axis=1) + np.abs(np.diff(yaw))
     pace = np.concatenate([[0], np.cumsum(steps)])
     even = np.linspace(0, pace[-1], frames)
@@ -117,9 +117,15 @@ def camera_path(frames: int) -> np.ndarray:
 
 
 class ApartmentStream:
-    """A depth camera that is carried through the apartment; a sequence of (cloud, pose).
+    """A depth camera carried through the apartment; a sequence of (cloud, pose).
 
-    Frames are rendered when they are asked for and depend on the arguments and the index only.
+    Frames are rendered on access and depend on the arguments and the index only.
+
+    Attributes:
+        model: The apartment, `mujoco.MjModel`.
+        poses_world_sensor: (frames, 4, 4) float64 T_world_sensor, m.
+        camera: The depth camera.
+        max_range: Most range of a return, m.
     """
 
     def __init__(
@@ -131,114 +137,66 @@ class ApartmentStream:
         seed: int = 0,
         noise: bool = True,
     ) -> None:
-        """Prepares the camera; its horizontal field of view is 90 degrees.
+        """Prepares the camera, whose horizontal field of view is 90 degrees.
 
         Args:
-          frames: length of the stream; the path is the same for any, see `camera_path`.
-          width: pixels a row.
-          height: pixels a column.
-          max_range: metres along a ray; nothing farther, and nothing nearer than 0.3 m, returns.
-          seed: of the noise.
-          noise: whether depths are noisy (as a Kinect's), some pixels drop out, and some fly
-            between foreground and background at depth edges.
+            frames: Length of the stream. The path does not depend on it, see `camera_path`.
+            width: Pixels per row.
+            height: Pixels per column.
+            max_range: Most range of a return, m. The least is 0.3 m.
+            seed: Seed of the noise.
+            noise: Whether depths have a Kinect's noise, some pixels drop out, and some fly between
+                foreground and background at depth edges.
 
         Raises:
-          ValueError: frames, width or height < 1, or max_range <= 0.3.
+            ValueError: `frames`, `width` or `height` < 1, or `max_range` <= 0.3.
         """
         self.model = load_model()
         self.poses_world_sensor = camera_path(frames)
         self.camera = DepthCamera(self.model, width, height, max_range, noise)
-        self.height, self.width = height, width
-        self.max_range, self.seed, self.noise = max_range, seed, noise
+        self.max_range, self.seed = max_range, seed
 
     def __len__(self) -> int:
-        """The number of frames."""
+        """Returns the number of frames."""
         return len(self.poses_world_sensor)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Renders a frame.
 
         Args:
-          index: 0 <= index < len(self).
+            index: 0 <= index < len(self).
 
         Returns:
-          cloud: (height * width, 3) float32, metres, sensor frame, row by row of the image; a row
-            of NaN is no return.
-          pose: (4, 4) float32, T_world_sensor.
+            cloud: (height * width, 3) float32, m, sensor frame, row-major; a row of NaN is no
+                return.
+            pose: (4, 4) float32, T_world_sensor.
 
         Raises:
-          IndexError: the index is out of range.
+            IndexError: The index is out of range.
         """
-        pose = self._pose(index)
-        return self.camera.cloud(pose, (self.seed, index)), pose.astype(np.float32)
-
-    def exact_depth(self, index: int) -> np.ndarray:
-        """Casts the rays of a frame, with neither noise nor a limit of range.
-
-        Args:
-          index: 0 <= index < len(self).
-
-        Returns:
-          (height * width,) float64, depth along the optical axis in metres; finite, since the
-          apartment is closed.
-
-        Raises:
-          IndexError: the index is out of range.
-        """
-        return self.camera.exact_depth(self._pose(index))
-
-    def exact_surface(self, index: int) -> np.ndarray:
-        """Finds the surface points that a frame sees within the camera's limits of range.
-
-        Args:
-          index: 0 <= index < len(self).
-
-        Returns:
-          (n, 3) float64, metres, world; n <= height * width.
-
-        Raises:
-          IndexError: the index is out of range.
-        """
-        return self.exact_parts(index)[0]
-
-    def exact_parts(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Finds the surface points that a frame sees, and what they are on.
-
-        Args:
-          index: 0 <= index < len(self).
-
-        Returns:
-          points_world: (n, 3) float64, metres, those of `exact_surface`.
-          geom: (n,) int32, which geom of the model each point is on.
-
-        Raises:
-          IndexError: the index is out of range.
-        """
-        return self.camera.exact_parts(self._pose(index))
-
-    def _pose(self, index: int) -> np.ndarray:
         if not 0 <= index < len(self):
             raise IndexError(f"index = {index}, expected 0 <= index < {len(self)}")
-        return self.poses_world_sensor[index]
+        pose = self.poses_world_sensor[index]
+        return self.camera.cloud(pose, (self.seed, index)), pose.astype(np.float32)
 
 
-def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> GroundTruth:
-    """Draws points of the free space that a stream sees, with the exact distances there.
+def sample_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> GroundTruth:
+    """Draws points of the free space that a stream observes, with the exact distances there.
 
-    The frame of each point is drawn uniformly, then a pixel of the frame that sees a surface, then
-    the place on the ray between the sensor and that surface.
+    Each point lies on a ray between the sensor and a surface: its frame, pixel and place on the ray
+    are drawn uniformly.
 
     Args:
-      stream: whose exact rays, not its noise, say what is free.
-      count: how many points in free space, and how many on surfaces.
-      seed: of the draws.
+        stream: The stream; its exact rays, without noise, define free space.
+        count: Number of points in free space, and of points on surfaces.
+        seed: Seed of the draws.
 
     Returns:
-      The exact distances; frame is the one that the point was drawn from. Thin points are up to
-      50 of each thin part that at least 10 rays met.
+        The exact distances, each with the frame that its point was drawn from. Thin points are up
+        to 50 per thin part that at least 10 rays hit.
 
     Raises:
-      ValueError: a frame that was drawn sees no surface.
+        ValueError: A frame sees no surface.
     """
     rng = np.random.default_rng(seed)
     quotas = rng.multinomial(count, np.full(len(stream), 1 / len(stream)), size=2).T
@@ -247,17 +205,18 @@ def ground_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> 
     )
     free, surface, frames, thin, part = [], [], [], [], []
     for index, (free_quota, surface_quota) in enumerate(quotas):
-        seen, geom = stream.exact_parts(index)
+        pose = stream.poses_world_sensor[index]
+        seen, geom = stream.camera.exact_surface(pose)
         if not len(seen):
             raise ValueError(f"frame {index} sees no surface within {stream.max_range} m")
-        origin = stream.poses_world_sensor[index, :3, 3]
+        origin = pose[:3, 3]
         along = rng.uniform(size=(free_quota, 1))
         free.append(origin + along * (rng.choice(seen, free_quota) - origin))
         surface.append(rng.choice(seen, surface_quota))
         frames.append(np.full(free_quota, index, np.int32))
         thin.append(seen[is_thin[geom]])
         part.append(geom[is_thin[geom]])
-    # Rounded before the distance is taken, so that it is exact at the very points handed out.
+    # Rounded first, so that the distances are exact at the points that are returned.
     points = np.concatenate(free).astype(np.float32)
     sdf, grad = signed_distance(stream.model, points)
     chosen = choose_thin(np.concatenate(part), rng)

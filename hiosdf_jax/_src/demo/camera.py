@@ -1,4 +1,4 @@
-"""A depth camera in a MuJoCo model whose geoms do not move."""
+"""A depth camera in a static MuJoCo model."""
 
 # mujoco's bindings carry no types that pyright can see.
 # pyright: reportAttributeAccessIssue=false
@@ -10,14 +10,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-_MIN_RANGE = 0.3  # m, a depth camera is blind nearer than that
-_DROP_OUT = 0.005  # share of the pixels that see nothing for no reason
-_FLYING = 0.15  # share of the pixels at a depth edge that mix foreground and background
-_EDGE = 0.1  # step of depth between neighbours, relative to the nearer one, that makes an edge
+_MIN_RANGE = 0.3  # m, below which a depth camera is blind
+_DROP_OUT = 0.005  # fraction of pixels that drop out at random
+_FLYING = 0.15  # fraction of pixels at a depth edge that mix foreground and background
+_EDGE = 0.1  # depth step to a neighbor that makes an edge, relative to the nearer depth
 
 
 class DepthCamera:
-    """A pinhole camera, its horizontal field of view 90 degrees; x right, y down, z forward."""
+    """A pinhole camera, horizontal field of view 90 degrees; x right, y down, z forward."""
 
     def __init__(
         self, model: mujoco.MjModel, width: int, height: int, max_range: float, noise: bool
@@ -25,15 +25,15 @@ class DepthCamera:
         """Prepares the camera.
 
         Args:
-          model: what it sees, at the model's initial configuration.
-          width: pixels a row.
-          height: pixels a column.
-          max_range: metres along a ray; nothing farther, and nothing nearer than 0.3 m, returns.
-          noise: whether depths are noisy (as a Kinect's), some pixels drop out, and some fly
-            between foreground and background at depth edges.
+            model: The scene, in the model's initial configuration.
+            width: Pixels per row.
+            height: Pixels per column.
+            max_range: Most range of a return, m. The least is 0.3 m.
+            noise: Whether depths have a Kinect's noise, some pixels drop out, and some fly between
+                foreground and background at depth edges.
 
         Raises:
-          ValueError: width or height < 1, or max_range <= 0.3.
+            ValueError: `width` or `height` < 1, or `max_range` <= 0.3.
         """
         if width < 1 or height < 1:
             raise ValueError(f"width, height = {width}, {height}, expected >= 1")
@@ -43,7 +43,7 @@ class DepthCamera:
         self.max_range, self.noise = max_range, noise
         self._model, self._data = model, mujoco.MjData(model)
         mujoco.mj_forward(model, self._data)
-        # The ray through the middle of every pixel, with a depth (z) of 1.
+        # The ray through the center of every pixel, with a depth (z) of 1.
         focal = width / 2  # pixels: half the width spans 45 degrees
         u = (np.arange(width) + 0.5 - width / 2) / focal
         v = (np.arange(height) + 0.5 - height / 2) / focal
@@ -52,15 +52,14 @@ class DepthCamera:
         self._lengths = np.linalg.norm(self._rays, axis=1)
 
     def cloud(self, pose: np.ndarray, seed: Any) -> np.ndarray:
-        """Takes a picture.
+        """Takes an image.
 
         Args:
-          pose: (4, 4) T_world_sensor, metres.
-          seed: of the noise, for `numpy.random.default_rng`.
+            pose: (4, 4) T_world_sensor, m.
+            seed: Seed of the noise, for `numpy.random.default_rng`.
 
         Returns:
-          (height * width, 3) float32, metres, sensor frame, row by row of the image; a row of NaN
-          is no return.
+            (height * width, 3) float32, m, sensor frame, row-major; a row of NaN is no return.
         """
         depth = self.exact_depth(pose)
         if self.noise:
@@ -69,37 +68,26 @@ class DepthCamera:
         return (depth[:, None] * self._rays).astype(np.float32)
 
     def exact_depth(self, pose: np.ndarray) -> np.ndarray:
-        """Casts the rays, with neither noise nor a limit of range.
+        """Casts the rays, without noise and without limits of range.
 
         Args:
-          pose: (4, 4) T_world_sensor, metres.
+            pose: (4, 4) T_world_sensor, m.
 
         Returns:
-          (height * width,) float64, depth along the optical axis in metres; negative where a ray
-          hits nothing, which in a closed model it always does.
+            (height * width,) float64, depth along the optical axis, m; negative where a ray hits
+            nothing, which cannot happen in a closed model.
         """
         return self._cast(pose)[0]
 
-    def exact_surface(self, pose: np.ndarray) -> np.ndarray:
-        """Finds the surface points that are seen within the camera's limits of range.
+    def exact_surface(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Finds the surface points within the camera's limits of range.
 
         Args:
-          pose: (4, 4) T_world_sensor, metres.
+            pose: (4, 4) T_world_sensor, m.
 
         Returns:
-          (n, 3) float64, metres, world; n <= height * width.
-        """
-        return self.exact_parts(pose)[0]
-
-    def exact_parts(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Finds the surface points that are seen, and what they are on.
-
-        Args:
-          pose: (4, 4) T_world_sensor, metres.
-
-        Returns:
-          points_world: (n, 3) float64, metres, those of `exact_surface`.
-          geom: (n,) int32, which geom of the model each point is on.
+            points_world: (n, 3) float64, m; n <= height * width.
+            geom: (n,) int32, index of the geom that each point is on.
         """
         depth, geom = self._cast(pose)
         seen = self._in_range(depth)
@@ -107,7 +95,7 @@ class DepthCamera:
         return points_world, geom[seen]
 
     def _cast(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depths (height * width,) m, and the geoms that the rays met."""
+        """Depths (height * width,) m, and the geoms that the rays hit."""
         directions = (self._rays / self._lengths[:, None]) @ pose[:3, :3].T
         count = len(directions)
         ranges, geoms = np.empty(count), np.empty(count, np.int32)
@@ -117,7 +105,7 @@ class DepthCamera:
             pnt=pose[:3, 3],
             vec=directions.ravel(),
             geomgroup=None,  # every group
-            flg_static=True,  # static geoms, which all of these are, count
+            flg_static=True,  # static geoms included, and all of these are static
             bodyexclude=-1,
             geomid=geoms,
             dist=ranges,
@@ -133,20 +121,20 @@ class DepthCamera:
 
 
 def _add_noise(depth: np.ndarray, seed: Any) -> np.ndarray:
-    """What a structured-light camera makes of exact depths (H, W), metres; NaN where it drops out.
+    """Adds a structured-light camera's noise to exact depths (H, W), m; NaN is a dropped pixel.
 
     The noise is that of the Kinect (Nguyen, Izadi, Lovell: Modeling Kinect Sensor Noise for
     Improved 3D Reconstruction and Tracking, 3DIMPVT 2012).
     """
     rng = np.random.default_rng(seed)
     height, width = depth.shape
-    # A pixel flies where it averages over an edge: somewhere between itself and a neighbour.
+    # A flying pixel averages over an edge: its depth is between its own and a neighbor's.
     down, right = rng.integers(-1, 2, size=(2, height, width))
     row, column = np.indices(depth.shape)
-    neighbour = depth[np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
-    at_edge = np.abs(neighbour - depth) > _EDGE * np.minimum(depth, neighbour)
+    neighbor = depth[np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
+    at_edge = np.abs(neighbor - depth) > _EDGE * np.minimum(depth, neighbor)
     flies = at_edge & (rng.uniform(size=depth.shape) < _FLYING)
-    mixed = depth + rng.uniform(size=depth.shape) * (neighbour - depth)
+    mixed = depth + rng.uniform(size=depth.shape) * (neighbor - depth)
     depth = np.where(flies, mixed, depth)
 
     depth = depth + (0.0012 + 0.0019 * (depth - 0.4) ** 2) * rng.normal(size=depth.shape)

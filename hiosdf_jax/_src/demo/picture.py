@@ -1,4 +1,4 @@
-"""Pictures of a robot that explores: what it knew, where it meant to go, how near it came."""
+"""Pictures of an exploring robot: what it knew, its planned path, and its clearance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hiosdf_jax._src.demo.exploration import ROBOT, Moment, Run
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_LIMIT = 0.6  # m, end of the colours
+_LIMIT = 0.6  # m, end of the color scale
 _GIF_FRAMES = 60
 _GIF_INCHES, _GIF_DPI = (7.0, 5.9), 80
 _GIF_FRAME_MS, _GIF_LAST_MS = 150, 2500
@@ -25,7 +25,7 @@ def write_run(folder: Path, run: Run) -> None:
     """Writes `metrics.json`, `plan.png` and `plan.gif`.
 
     Args:
-        folder: Where to; it is there already.
+        folder: An existing folder.
         run: The run.
 
     Raises:
@@ -37,13 +37,13 @@ def write_run(folder: Path, run: Run) -> None:
 
 
 def save_picture(path: str | os.PathLike[str], run: Run) -> None:
-    """Draws three moments of a run, and its clearance over time.
+    """Draws three moments of a run and its clearance over time.
 
     Args:
-        path: The picture, in a format that its ending names.
+        path: The picture; its suffix names the format.
         run: The run.
     """
-    from matplotlib.figure import Figure  # without pyplot: Agg, whatever the user's backend is
+    from matplotlib.figure import Figure  # without pyplot: Agg, independent of the user's backend
 
     figure = Figure(figsize=(17, 8.6), layout="constrained")
     rows: Any = figure.subfigures(2, 1, height_ratios=(1.75, 1))
@@ -98,14 +98,14 @@ def save_animation(path: str | os.PathLike[str], run: Run) -> None:
         )
         canvas.draw()
         pixels = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-        # An octree keeps the few pixels of the goal and the way red; a median cut does not.
+        # An octree keeps the few pixels of goal and path red; a median cut does not.
         frames.append(pixels.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
     durations = [_GIF_FRAME_MS] * (len(frames) - 1) + [_GIF_LAST_MS]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
 def _draw_moment(ax: Axes, run: Run, moment: Moment) -> Any:
-    """Draws what the robot knew, seen from above; returns the image of the distances."""
+    """Draws what the robot knew, seen from above; returns the image of distances."""
     from matplotlib.patches import Circle
 
     (x0, y0, _), (x1, y1, _) = BOUNDS_WORLD
@@ -116,10 +116,10 @@ def _draw_moment(ax: Axes, run: Run, moment: Moment) -> Any:
     image = ax.imshow(
         distance, extent=extent, origin="lower", cmap="RdBu", vmin=-_LIMIT, vmax=_LIMIT
     )
-    # What has been seen at some heights only: the body may not go there yet.
+    # Cells seen at some heights only: the body may not enter them yet.
     veil = np.where(moment.cells.seen.T | ~np.isfinite(distance), np.nan, 0.75)
     ax.imshow(veil, extent=extent, origin="lower", cmap="gray", vmin=0, vmax=1, alpha=0.45)
-    x, y = (axis[:, 0] for axis in (run.plane.centres()[..., 0], run.plane.centres()[..., 1].T))
+    x, y = (axis[:, 0] for axis in (run.plane.centers()[..., 0], run.plane.centers()[..., 1].T))
     if np.nanmin(distance) < 0 < np.nanmax(distance):
         ax.contour(x, y, np.nan_to_num(distance, nan=1.0), levels=[0], colors="k", linewidths=1)
     for rollout in moment.rollouts:

@@ -1,9 +1,9 @@
-"""Exact signed distances to the geoms of a MuJoCo model, as ground truth for the demo.
+"""Exact signed distances to the geoms of a MuJoCo model.
 
 Boxes, spheres, capsules and cylinders have closed forms. The distance to their union is the minimum
-over the geoms: exact everywhere outside of solids. Inside a solid the boundary of the union may lie
-deeper than that of the geom which the point is in (where two walls meet, say), so that the value is
-then only an upper bound of the negative distance: |value| <= |exact|, with the right sign.
+over the geoms, exact everywhere outside of solids. Inside a solid the surface of the union may be
+farther than that of any one geom, for example where two walls meet. There the value has the right
+sign and |value| <= |exact|.
 """
 
 # mujoco's bindings carry no types that pyright can see.
@@ -13,29 +13,30 @@ import mujoco
 import numpy as np
 
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
+from hiosdf_jax._src.planning.robot.solids import cylinder_profile, distance_beyond
 
-# Points a pass: keeps the temporaries of one geom at a few megabytes.
+# Points per chunk: keeps the temporaries of one geom at a few megabytes.
 _CHUNK = 32768
 
 
 def signed_distance(
     model: mujoco.MjModel, points_world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes the exact signed distance to the geoms of a model, at its initial configuration.
+    """Computes the exact signed distance to the geoms of a model, in its initial configuration.
 
     Args:
-      model: a model whose geoms are boxes, spheres, capsules and cylinders only.
-      points_world: (N, 3) metres.
+        model: A model of boxes, spheres, capsules and cylinders only.
+        points_world: (N, 3) m.
 
     Returns:
-      sdf: (N,) float64, metres, positive outside of solids, where it is exact; inside a bound, see
-        the top of this module.
-      grad: (N, 3) float64, unit gradient of the geom that gave the minimum, pointing away from it.
-        Where that has none (the centre of a sphere, say), one of its directions of ascent.
+        sdf: (N,) float64, m, positive outside of solids, where it is exact. Inside, the sign is
+            right and |sdf| is at most the exact one.
+        grad: (N, 3) float64, unit gradient of the nearest geom's distance. Where that has none, for
+            example at the center of a sphere, one of its directions of ascent.
 
     Raises:
-      ValueError: points_world is not (N, 3) and finite, or the model has no geom or one of another
-        type.
+        ValueError: `points_world` is not (N, 3) and finite, or the model has no geom, or a geom of
+            another type.
     """
     points = np.asarray(points_world, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -69,7 +70,7 @@ def signed_distance(
 def _union(
     model: mujoco.MjModel, positions: np.ndarray, rotations: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Minimum over the geoms for one chunk; gradients are computed of the winners only."""
+    """Minimum over the geoms for one chunk; only the nearest geoms' gradients are computed."""
     best, winner = np.full(len(points), np.inf), np.zeros(len(points), int)
     kinds = model.geom_type.tolist()
     for geom, kind in enumerate(kinds):
@@ -87,7 +88,7 @@ def _union(
 
 
 def _box_distance(p: np.ndarray, half: np.ndarray) -> np.ndarray:
-    return _cornered_distance(np.abs(p) - half)
+    return distance_beyond(np.abs(p) - half)
 
 
 def _box_gradient(p: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -95,27 +96,17 @@ def _box_gradient(p: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def _cylinder_distance(p: np.ndarray, size: np.ndarray) -> np.ndarray:
-    return _cornered_distance(_profile(p, size))
+    return distance_beyond(cylinder_profile(p, size[0], size[1]))
 
 
 def _cylinder_gradient(p: np.ndarray, size: np.ndarray) -> np.ndarray:
-    g = _cornered_gradient(_profile(p, size))
+    g = _cornered_gradient(cylinder_profile(p, size[0], size[1]))
     radial = _unit(p[:, :2])
     return np.concatenate([g[:, :1] * radial, g[:, 1:] * _sign(p[:, 2:])], axis=1)
 
 
-def _profile(p: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """A cylinder is a rectangle (radius by half length) in the coordinates (radial, axial)."""
-    return np.stack([np.hypot(p[:, 0], p[:, 1]) - size[0], np.abs(p[:, 2]) - size[1]], axis=1)
-
-
-def _cornered_distance(q: np.ndarray) -> np.ndarray:
-    """Distance to {q <= 0}: q holds the signed distances beyond each pair of faces."""
-    outside = np.maximum(q, 0)
-    return np.sqrt(np.einsum("ij,ij->i", outside, outside)) + np.minimum(q.max(axis=1), 0)
-
-
 def _cornered_gradient(q: np.ndarray) -> np.ndarray:
+    """Gradient of `distance_beyond`."""
     # Divided by the largest first: the squares of tiny components would underflow to a norm of 0.
     largest = q.max(axis=1, keepdims=True)
     scaled = np.maximum(q, 0) / np.where(largest > 0, largest, 1)
@@ -147,18 +138,18 @@ def _from_axis(p: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
-    """Unit vectors; the first axis stands in where v is zero."""
+    """Unit vectors; the first axis where v is zero."""
     norm = np.linalg.norm(v, axis=1, keepdims=True)
     fallback = np.eye(v.shape[1])[0]
     return np.where(norm > 0, v, fallback) / np.where(norm > 0, norm, 1)
 
 
 def _sign(x: np.ndarray) -> np.ndarray:
-    """Sign with sign(0) = 1, so that gradients in a plane of symmetry keep their length."""
+    """Sign with sign(0) = 1: gradients in a plane of symmetry keep their length."""
     return np.where(x < 0, -1.0, 1.0)
 
 
-# Distance and gradient, of (n, 3) points in the frame of a geom and its (3,) sizes.
+# Distance and gradient as functions of (n, 3) points in the geom's frame and its (3,) sizes.
 _PRIMITIVES = {
     int(mujoco.mjtGeom.mjGEOM_BOX): (_box_distance, _box_gradient),
     int(mujoco.mjtGeom.mjGEOM_SPHERE): (_sphere_distance, _sphere_gradient),
