@@ -1,6 +1,6 @@
 """The quickstart runs, and the stored notebook is what its text source gives.
 
-    python tests/test_notebooks.py    # executes notebooks/quickstart.py and stores the notebook
+python tests/test_notebooks.py    # executes notebooks/quickstart.py and stores the notebook
 """
 
 import re
