@@ -14,7 +14,8 @@ import hiosdf_jax as hio
 from benchmarks.speed.processes import resident_mb
 from benchmarks.speed.rows import Baseline, Measured, Row, single, spread_of, time_ms
 from benchmarks.speed.setup import Setup
-from hiosdf_jax._src.mapping import intake, pipeline
+from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.numerics import posed_cloud
 from hiosdf_jax._src.state import MapState
 
 _TURNS = 5
@@ -57,7 +58,7 @@ def whole_updates(setup: Setup, label: str, mapped: Mapped) -> Measured:
     """
     state = mapped.state
     cloud, pose = setup.frame(int(state.updates))
-    prepared = jax.device_put(intake.prepare(cloud, pose, state.config.max_points))
+    prepared = jax.device_put(posed_cloud.prepare(cloud, pose, state.config.max_points))
     alone = time_ms(pipeline._update_jit, state, *prepared, seconds=setup.sizes.seconds)
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     resident = resident_mb(resource.getrusage(resource.RUSAGE_SELF))

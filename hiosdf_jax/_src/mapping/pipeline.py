@@ -12,11 +12,10 @@ import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.evidence import empty_grid
-from hiosdf_jax._src.mapping import intake
 from hiosdf_jax._src.mapping.calibration import initial_optimism
 from hiosdf_jax._src.mapping.stages import begin, run_stages
 from hiosdf_jax._src.network.training import init_network
-from hiosdf_jax._src.numerics.posed_cloud import check_shapes
+from hiosdf_jax._src.numerics.posed_cloud import check_shapes, prepare
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.state import Field, Flag, MapState, Report, field_of
 
@@ -100,7 +99,7 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
         check_shapes(cloud, pose)
         return _update(state, jnp.asarray(cloud), jnp.asarray(pose))
     compiled = _update_donating if donate else _update_jit
-    return compiled(state, *intake.prepare(cloud, pose, state.config.max_points))
+    return compiled(state, *prepare(cloud, pose, state.config.max_points))
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
