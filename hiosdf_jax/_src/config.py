@@ -32,6 +32,7 @@ class Config:
     Attributes:
         bounds: Corners ((x0, y0, z0), (x1, y1, z1)) of the mapped box, m, world frame. The grid
             covers it with whole voxels; a voxel corner lies at the world's origin.
+        voxel_size: Edge of a voxel, m [IV-B].
 
         Clouds:
         max_points: Rows of a cloud that one update uses. Larger clouds are drawn from at random,
@@ -42,7 +43,6 @@ class Config:
             Hits are averaged with weight 1 / sigma^2, so only relative sizes matter.
 
         Grid [IV-B]:
-        voxel_size: Edge of a voxel, m.
         min_hits: Hits that a voxel needs before its patch counts as surface.
         min_hit_ratio: A patch that fills its voxel is carved below this share
             hits / (hits + passes); smaller patches need less, by their area.
@@ -89,6 +89,7 @@ class Config:
     """
 
     bounds: Bounds
+    voxel_size: float = _number(0.10, 1e-3, 10.0)
 
     # Clouds
     max_points: int = _number(50_000, 1, 10_000_000)
@@ -97,7 +98,6 @@ class Config:
     range_noise: tuple[float, float] = (0.005, 0.002)
 
     # Grid
-    voxel_size: float = _number(0.10, 1e-3, 10.0)
     min_hits: int = _number(2, 1, 1_000)
     min_hit_ratio: float = _number(0.25, 0.0, 1.0)
     evidence_limit: float = _number(100.0, 1.0, 1000.0)
