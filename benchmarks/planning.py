@@ -1,12 +1,13 @@
-"""Clearances of many spheres with gradients: baked field, served field and network, in one run.
+"""Times clearances of many spheres with gradients by baked field, field and network.
 
     python benchmarks/planning.py                  # 1,048,576 spheres: a GPU
     python benchmarks/planning.py --count 65536    # two CPU cores
 
-The three take turns, so that what slows the machine slows them alike, and are compared call by
-call: times and ratios to the baked field are medians with the 10th and 90th percentile over the
-turns. Results are blocked on; compilation and the first turns are left out. `swept` is the swept
-clearance of as many spheres on the baked field, without gradient.
+The calls take turns, so that other load on the machine affects them alike. Times and ratios to the
+baked field are medians with the 10th and 90th percentile over the turns, without compilation and
+the first turns. `blended` is the field itself, grid and network combined. `swept` is the swept
+clearance of as many spheres on the baked field, without gradient. All of them use the policy
+`unknown="network"`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ WARMUP_TURNS = 2
 
 
 def make_field(config_name: str, stream_path: Path | None, frames: int) -> hio.Field:
-    """Maps the first frames of a stream, of the demo's apartment if none is given."""
+    """Maps the first frames of a stream, by default of the demo's apartment."""
     if stream_path is None:
         stream, bounds, max_range = demo.ApartmentStream(frames=frames), demo.BOUNDS_WORLD, 6.0
     else:
@@ -50,13 +52,13 @@ def make_field(config_name: str, stream_path: Path | None, frames: int) -> hio.F
 def network_clearance_and_grad(
     field: hio.Field, centers_world: jax.Array, radii: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The same as `sphere_clearance_and_grad`, by the network alone."""
+    """Computes `sphere_clearance_and_grad` by the network alone."""
     value, gradient = blend.network_sdf_and_grad(field, centers_world)
     return value - radii, gradient
 
 
 def take_turns(calls: dict[str, Callable[[], Any]], turns: int) -> dict[str, np.ndarray]:
-    """Milliseconds of each call, (turns,), one after the other in each turn."""
+    """Times the calls one after the other in each turn, (turns,) ms each."""
     times = {name: [] for name in calls}
     for turn in tqdm(range(-WARMUP_TURNS, turns), desc="timing"):
         for name, call in calls.items():
@@ -69,7 +71,7 @@ def take_turns(calls: dict[str, Callable[[], Any]], turns: int) -> dict[str, np.
 
 
 def spread(values: np.ndarray) -> dict[str, float]:
-    """Median and percentiles."""
+    """Returns the median and percentiles."""
     names = {"p10": 10, "median": 50, "p90": 90}
     return {name: float(np.percentile(values, share)) for name, share in names.items()}
 
@@ -83,13 +85,13 @@ def measure(field: hio.Field, count: int, resolution: float, turns: int) -> dict
     way = jax.random.normal(way_key, (count, 3))
     ends = centers + MOTION * way / jnp.linalg.norm(way, axis=-1, keepdims=True)
     radii = jnp.full(count, RADIUS)
-    clearance = jax.jit(planning.sphere_clearance_and_grad)
+    clearance = jax.jit(partial(planning.sphere_clearance_and_grad, unknown="network"))
     network = jax.jit(network_clearance_and_grad)
-    swept = jax.jit(planning.swept_clearance)
+    swept = jax.jit(partial(planning.swept_clearance, unknown="network"))
     times = take_turns(
         {
             "baked": lambda: clearance(baked, centers, radii),
-            "served": lambda: clearance(field, centers, radii),
+            "blended": lambda: clearance(field, centers, radii),
             "network": lambda: network(field, centers, radii),
             "swept": lambda: swept(baked, centers, ends, radii),
         },
@@ -106,12 +108,14 @@ def measure(field: hio.Field, count: int, resolution: float, turns: int) -> dict
 
 def main() -> None:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(description="Time of clearances, as ratios.")
-    parser.add_argument("--count", type=int, default=1_048_576, help="spheres")
+    parser = argparse.ArgumentParser(description="Times of sphere clearances and their ratios.")
+    parser.add_argument("--count", type=int, default=1_048_576, help="number of spheres")
     parser.add_argument("--config", default="default")
-    parser.add_argument("--stream", type=Path, help=".npz; the demo's apartment if left out")
-    parser.add_argument("--frames", type=int, default=10, help="mapped before the timing")
-    parser.add_argument("--resolution", type=float, default=0.05, help="of the baked field, m")
+    parser.add_argument("--stream", type=Path, help=".npz file (default: the demo's apartment)")
+    parser.add_argument("--frames", type=int, default=10, help="frames mapped before the timing")
+    parser.add_argument(
+        "--resolution", type=float, default=0.05, help="resolution of the baked field, m"
+    )
     parser.add_argument("--turns", type=int, default=20)
     parser.add_argument("--output", type=Path, default=Path("hiosdf_output/planning.json"))
     arguments = parser.parse_args()

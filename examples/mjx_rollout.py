@@ -1,4 +1,4 @@
-"""Predictive control of a rover and an arm: 1024 rollouts in MJX a step, the map in the cost."""
+"""Predictive control of a rover and an arm: 1024 MJX rollouts per step, the map in the cost."""
 
 import pathlib
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from mujoco import mjx
 from scene import build_map, exact_sdf
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.planning.adapters.mjx import rollout, sphere_geoms
+from hiosdf_jax import planning
 
 HORIZON, HOLD = 16, 5  # controls, of 5 steps of 0.02 s
 MARGIN = 0.08  # m
 
 
 class Task(NamedTuple):
-    """A robot, where it begins, where its last ball shall go, and in how many steps of 0.1 s."""
+    """A robot, its start, the goal of its last ball, and the number of steps of 0.1 s."""
 
     model: str
     qpos: tuple[float, ...]
@@ -31,14 +31,14 @@ ARM = Task("arm.xml", (-2.0, -0.6, 0.8, 0.3), (1.75, 2.75, 0.75), 25)
 
 
 def load(task):
-    """The robot's model."""
+    """Returns the robot's model."""
     return mujoco.MjModel.from_xml_path(str(pathlib.Path(__file__).with_name(task.model)))
 
 
 def make_planner(model, goal_world, rollouts=1024):
-    """Returns the jitted (field, qpos, qvel, mean, key) -> a better mean, the cost of `mean`."""
+    """Returns the jitted (field, qpos, qvel, mean, key) -> better mean, cost of `mean`."""
     robot, rest = mjx.put_model(model), mjx.make_data(model)
-    geoms, radii = sphere_geoms(model)
+    geoms, radii = planning.mjx.sphere_geoms(model)
     low, high = jnp.asarray(model.actuator_ctrlrange.T, jnp.float32)
 
     @jax.jit
@@ -47,8 +47,9 @@ def make_planner(model, goal_world, rollouts=1024):
         noise = 0.4 * high * jax.random.normal(keys[0], (rollouts, *mean.shape))
         steady = 0.6 * high * jax.random.normal(keys[1], (rollouts, 1, mean.shape[1]))
         controls = jnp.clip(mean + (noise + steady).at[0].set(0), low, high)
-        future = rollout(robot, rest.replace(qpos=qpos, qvel=qvel), controls, geoms, HOLD)
-        clearance = hio.sdf(field, future.centers_world, unknown="obstacle") - radii
+        start = rest.replace(qpos=qpos, qvel=qvel)
+        future = planning.mjx.rollout(robot, start, controls, geoms, HOLD)
+        clearance = planning.sphere_clearance(field, future.centers_world, radii)
         to_goal = jnp.linalg.norm(future.centers_world[:, :, -1] - jnp.array(goal_world), axis=-1)
         too_near = jax.nn.relu(MARGIN - clearance)
         costs = to_goal.sum(1) + 200 * too_near.sum((1, 2)) + 1000 * (clearance < 0).sum((1, 2))
@@ -59,8 +60,8 @@ def make_planner(model, goal_world, rollouts=1024):
 
 
 def drive(task, model, plan, field):
-    """Drives the robot in MuJoCo; returns its distance to the goal and its least clearance, m."""
-    robot, (geoms, radii) = mujoco.MjData(model), sphere_geoms(model)
+    """Drives the robot in MuJoCo; returns its distance to the goal and least clearance, m."""
+    robot, (geoms, radii) = mujoco.MjData(model), planning.mjx.sphere_geoms(model)
     robot.qpos[:] = task.qpos
     mean, clearance = jnp.zeros((HORIZON, model.nu)), np.inf
     for key in jax.random.split(jax.random.key(1), task.steps):

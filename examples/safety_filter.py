@@ -1,4 +1,4 @@
-"""A reckless robot that drives straight at its goals, and the map as the barrier that stops it."""
+"""A safety filter: the map stops a reckless robot that drives straight at its goals."""
 
 import warnings
 
@@ -8,24 +8,25 @@ import numpy as np
 from scene import ROOM, build_map, exact_sdf
 
 import hiosdf_jax as hio
+from hiosdf_jax import planning
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # cbfpy's advice on how to set up a CPU
-    from hiosdf_jax._src.planning.adapters.cbf import inscribed, velocity_filter
+    warnings.simplefilter("ignore")  # cbfpy's advice on CPU setup
+    from hiosdf_jax.planning import cbf
 
 RADIUS, SPEED, DT = 0.15, 1.0, 0.05  # m, m/s along each axis, s
-# What it travels within DT, and 3 cm for the map's error.
+# The distance traveled within DT, and 3 cm for the map's error.
 MARGIN = 3**0.5 * SPEED * DT + 0.03
 
 
 def body(position):
-    """A ball, and six smaller ones in it, so that it sees every wall of a corner."""
-    return inscribed(position[None], jnp.array([RADIUS]))
+    """A ball with six smaller ones inside, which see every wall of a corner."""
+    return cbf.inscribed(position[None], jnp.array([RADIUS]))
 
 
 def make_simulator(steps=80):
     """Returns the jitted (field, starts, goals) -> paths without and with the filter."""
-    safe = velocity_filter(body, [SPEED] * 3, margin_m=MARGIN, unknown="obstacle")
+    safe = cbf.velocity_filter(body, [SPEED] * 3, margin_m=MARGIN)
 
     def reckless(field, position, goal):
         return jnp.clip(10 * (goal - position), -SPEED, SPEED)
@@ -51,15 +52,15 @@ def make_simulator(steps=80):
 
 
 def draw(count, rng, field):
-    """Starts that the robot may be in, (count, 3) m, and goals in the room and beyond its walls."""
+    """Draws safe starts, (count, 3) m, and goals in the room and beyond its walls."""
     starts = rng.uniform(*ROOM, (50 * count, 3)).astype(np.float32)
-    known = np.asarray(hio.sdf(field, starts, unknown="obstacle"))
-    starts = starts[(exact_sdf(starts) > RADIUS) & (known > RADIUS + MARGIN)][:count]
+    known = np.asarray(planning.sphere_clearance(field, starts, RADIUS))
+    starts = starts[(exact_sdf(starts) > RADIUS) & (known > MARGIN)][:count]
     return starts, rng.uniform(ROOM[0] - 0.5, ROOM[1] + 0.5, starts.shape).astype(np.float32)
 
 
 def least_clearance(paths):
-    """The least exact clearance of each path, (B,) m."""
+    """Returns the least exact clearance of each path, (B,) m."""
     return (exact_sdf(paths) - RADIUS).min(axis=1)
 
 

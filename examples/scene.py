@@ -1,4 +1,4 @@
-"""What the examples map: a closed room with furniture, scanned in simulation from a few places."""
+"""The scene of the examples: a closed, furnished room, scanned in simulation from six places."""
 
 import jax
 import numpy as np
@@ -21,7 +21,7 @@ VIEWPOINTS = (
 
 
 def exact_sdf(points_world):
-    """The exact signed distance, (..., 3) m -> (...) m, float64 (inside of solids a bound)."""
+    """Exact signed distance, (..., 3) m -> (...) m, float64; inside of solids a bound."""
     points = np.asarray(points_world, np.float64)
     distance = np.minimum(points - ROOM[0], ROOM[1] - points).min(axis=-1)
     for low, high in BOXES:
@@ -32,7 +32,7 @@ def exact_sdf(points_world):
 
 
 def scan(position_world, rays, rng):
-    """What a LiDAR sees from there: (rays, 3) m in its frame, and its (4, 4) T_world_sensor."""
+    """Simulates a LiDAR scan: (rays, 3) m in the sensor frame, and (4, 4) T_world_sensor."""
     directions = rng.normal(size=(rays, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ranges = np.zeros(rays)
@@ -44,7 +44,7 @@ def scan(position_world, rays, rng):
 
 
 def build_map(rays=10_000, **overrides):
-    """Maps the room from the viewpoints; overrides are of `Config.light`."""
+    """Maps the room from all viewpoints by `Config.light` with overrides."""
     settings = {"bounds": (ROOM[0] - 0.2, ROOM[1] + 0.2), "max_points": rays} | overrides
     state = hio.init(hio.Config.light(**settings), jax.random.key(0))
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The safety filter: the quadratic programme it solves, corners, unseen space, reckless robots."""
+"""The safety filter: its quadratic program, corners, unseen space and reckless robots."""
 
 import warnings
 
@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    from hiosdf_jax._src.planning.adapters.cbf import inscribed, velocity_filter
+    from hiosdf_jax.planning import cbf
 
 LIMITS = np.array([0.5, 1.0, 2.0])
 MARGIN, GAIN = 0.05, 4.0
@@ -28,14 +28,14 @@ def chain(q):
 
 
 def barriers(normal, offset, q):
-    """The same in float64, of a half space: what the filter keeps above zero, (S,) m."""
+    """The barriers of a half space in float64, which the filter keeps above zero, (S,) m."""
     angles = np.cumsum(np.asarray(q, float))
     steps = LINKS[:, None] * np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
     return np.cumsum(steps, axis=0) @ normal + offset - RADII - MARGIN
 
 
 def nearest_safe(normal, offset, q, desired):
-    """What the filter should answer, by SLSQP on differenced barriers."""
+    """The expected velocity, by SLSQP on differenced barriers."""
     values = barriers(normal, offset, q)
     step = 1e-6 * np.eye(3)
     slopes = [barriers(normal, offset, q + e) - barriers(normal, offset, q - e) for e in step]
@@ -51,13 +51,15 @@ def nearest_safe(normal, offset, q, desired):
     return LIMITS * found.x
 
 
-def test_it_answers_the_nearest_safe_velocity_and_compiles_once_for_200_maps():
-    safe, traces = count_traces(velocity_filter(chain, LIMITS, margin_m=MARGIN, gain_per_s=GAIN))
+def test_it_returns_the_nearest_safe_velocity_and_compiles_once_for_200_maps():
+    safe, traces = count_traces(
+        cbf.velocity_filter(chain, LIMITS, margin_m=MARGIN, gain_per_s=GAIN)
+    )
     controller = jax.jit(safe)
     rng = np.random.default_rng(1)
     q = rng.uniform(-3, 3, (200, 3)).astype(np.float32)
     wish = (rng.uniform(-1, 1, (200, 3)) * LIMITS).astype(np.float32)
-    # From one step to the next the map alone changes.
+    # Between the steps of a pair only the map changes.
     q[1::2], wish[1::2] = q[::2], wish[::2]
     answers, expected = np.zeros((2, 200, 3))
     for k in range(200):
@@ -74,28 +76,29 @@ def test_it_answers_the_nearest_safe_velocity_and_compiles_once_for_200_maps():
 
 @pytest.fixture(scope="module")
 def ball():
-    """A filter of a ball of 0.2 m with no margin."""
-    return velocity_filter(lambda p: (p[None], np.array([0.2])), [1.0] * 3, margin_m=0.0)
+    """A filter for a ball of 0.2 m, without margin."""
+    safe = cbf.velocity_filter(lambda p: (p[None], np.array([0.2])), [1.0] * 3, margin_m=0.0)
+    return jax.jit(safe)
 
 
-def test_a_body_in_the_surface_leaves_it_as_fast_as_it_may(ball):
+def test_a_body_in_collision_leaves_at_its_velocity_limit(ball):
     wall = half_space([1.0, 0, 0], 0.0)  # solid where x < 0
     out = ball(wall, jnp.array([-1.0, 0, 0]), jnp.array([-1.0, 0, 0]))
     np.testing.assert_allclose(out, [1, 0, 0], atol=0.03)
-    # 0.1 m too deep: dh/dt >= 0.5 m/s, and along the wall it goes on as it likes.
+    # 0.1 m too deep: dh/dt >= 0.5 m/s, and motion along the wall is free.
     out = ball(wall, jnp.array([0.1, 0, 0]), jnp.array([-1.0, 0.7, 0]))
     np.testing.assert_allclose(out, [0.5, 0.7, 0], atol=0.03)
 
 
-def test_unseen_space_is_solid_unless_told_otherwise(ball):
+def test_unseen_space_is_solid_by_default(ball):
     field = half_space([1.0, 0, 0], 6.0)  # the wall is at x = -6 m
-    field = field.replace(frontier=half_space([1.0, 0, 0], 0.0).sdf)  # and x < 0 was not seen
+    field = field.replace(frontier=half_space([1.0, 0, 0], 0.0).sdf)  # and x < 0 is unseen
     q, wish = jnp.array([0.2, 0.0, 0.0]), jnp.array([-0.8, 0.0, 0.0])
     np.testing.assert_allclose(ball(field, q, wish), 0, atol=0.01)
-    bold = velocity_filter(
+    bold = cbf.velocity_filter(
         lambda p: (p[None], np.array([0.2])), [1.0] * 3, margin_m=0.0, unknown="network"
     )
-    np.testing.assert_allclose(bold(field, q, wish), wish, atol=0.01)
+    np.testing.assert_allclose(jax.jit(bold)(field, q, wish), wish, atol=0.01)
 
 
 def test_it_stops_where_the_solver_fails(ball):
@@ -107,7 +110,7 @@ def test_it_stops_where_the_solver_fails(ball):
 def test_inscribed_spheres_touch_theirs_from_inside():
     centers = np.random.default_rng(0).normal(size=(4, 3))
     radii = np.array([0.1, 0.2, 0.3, 0.4])
-    more, sizes = inscribed(centers, radii, 0.25)
+    more, sizes = cbf.inscribed(centers, radii, 0.25)
     assert more.shape == (28, 3)
     np.testing.assert_allclose(more[:4], centers, rtol=1e-6)
     inner = np.asarray(more[4:])
@@ -124,7 +127,9 @@ def corner(points):
 
 def test_in_a_corner_one_sphere_sinks_in_and_inscribed_ones_do_not(ball):
     field = baked(corner, [-0.4, -0.4, -0.2], [1.2, 1.2, 0.2], 0.02)
-    seven = velocity_filter(lambda p: inscribed(p[None], np.array([0.2])), [1.0] * 3, margin_m=0.0)
+    seven = cbf.velocity_filter(
+        lambda p: cbf.inscribed(p[None], np.array([0.2])), [1.0] * 3, margin_m=0.0
+    )
 
     def least(safe):
         @jax.jit
@@ -148,7 +153,7 @@ def test_the_filtered_robot_never_collides_where_the_reckless_one_does():
     reckless, filtered = example.make_simulator()(field, starts, goals)
     assert (example.least_clearance(np.asarray(reckless, float)) < 0).mean() > 0.5
     assert example.least_clearance(np.asarray(filtered, float)).min() > 0.03
-    # And it is no coward: where the straight way is clear, it arrives.
+    # Where the straight line is clear, it arrives.
     clear = example.least_clearance(np.asarray(reckless, float)) > example.MARGIN + 0.02
     assert clear.sum() > 5
     arrived = np.linalg.norm(filtered[clear, -1] - goals[clear], axis=1)
@@ -164,9 +169,9 @@ def test_the_filtered_robot_never_collides_where_the_reckless_one_does():
         ({"gain_per_s": np.nan}, "gain_per_s"),
     ],
 )
-def test_bad_numbers_are_named(change, message):
+def test_bad_numbers_are_refused(change, message):
     good = {"velocity_limits": [1.0] * 3, "margin_m": 0.1}
     with pytest.raises(ValueError, match=message):
-        velocity_filter(chain, **(good | change))
+        cbf.velocity_filter(chain, **(good | change))
     with pytest.raises(ValueError, match="share"):
-        inscribed(np.zeros((1, 3)), [1.0], 1.0)
+        cbf.inscribed(np.zeros((1, 3)), [1.0], 1.0)

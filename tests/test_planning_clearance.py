@@ -1,21 +1,25 @@
-"""Clearances against plain geometry in float64, along motions too, and the cost made of them."""
+"""Clearances of spheres, at rest and in motion, and their cost, against plain geometry."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import baked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hiosdf_jax as hio
 from hiosdf_jax import planning
-from hiosdf_jax._src.state import Baked
 
-COUNT = 40  # spheres in nearly every test: what is compiled once serves them all
+COUNT = 40  # spheres in nearly every test, so that they share compilations
 RESOLUTION = 0.05
 LOW, HIGH = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])
-CLEARANCE = jax.jit(planning.sphere_clearance, static_argnames="unknown")
-SWEPT = jax.jit(planning.swept_clearance, static_argnames=("unknown", "evaluations"))
+clearance = partial(planning.sphere_clearance, unknown="network")
+swept_clearance = partial(planning.swept_clearance, unknown="network")
+CLEARANCE = jax.jit(clearance)
+SWEPT = jax.jit(swept_clearance, static_argnames="evaluations")
 SLOPES = jax.jit(jax.grad(lambda *arguments: SWEPT(*arguments).sum(), (1, 2)))
 BOXES = [  # center, half sizes; m
     (np.array([0.3, 0.2, 0.4]), np.array([0.2, 0.1, 0.4])),
@@ -32,27 +36,9 @@ def scene_distance(points):
     return np.min([box_distance(points, *box) for box in BOXES], axis=0)
 
 
-def bake_function(function, low=LOW, high=HIGH, resolution=RESOLUTION):
-    axes = [
-        np.arange(round((b - a) / resolution) + 1) * resolution + a
-        for a, b in zip(low, high, strict=True)
-    ]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    values = jnp.asarray(function(points), jnp.float32)
-    return Baked(
-        corner_world=jnp.asarray(low, jnp.float32),
-        resolution=jnp.float32(resolution),
-        sdf=values,
-        frontier=jnp.full_like(values, 10.0),
-        lower=values,
-        updates=jnp.int32(1),
-        stamp=jnp.float32(0),
-    )
-
-
 @pytest.fixture(scope="module")
 def scene():
-    return bake_function(scene_distance)
+    return baked(scene_distance, LOW, HIGH, RESOLUTION)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +48,7 @@ def field():
 
 
 def steepest(baked):
-    """No trilinear function is steeper than the root of the squares of its steepest edges."""
+    """Bound of a trilinear function's slope: the root of the squares of its steepest edges."""
     values = np.asarray(baked.sdf, float)
     slopes = [np.abs(np.diff(values, axis=k)).max() / RESOLUTION for k in range(3)]
     return float(np.linalg.norm(slopes))
@@ -74,20 +60,19 @@ def spheres(count, seed=0, margin=0.2):
     return centers, rng.uniform(0, 0.2, count).astype(np.float32)
 
 
-def test_clearance_is_the_distance_less_the_radius(scene):
+def test_clearance_is_the_distance_minus_the_radius(scene):
     centers, radii = spheres(500, margin=-0.05)
-    clearance = planning.sphere_clearance(scene, centers, radii)
-    assert clearance.shape == (500,)
+    found = clearance(scene, centers, radii)
+    assert found.shape == (500,)
     # Interpolation between samples of a distance errs by less than half a cell's diagonal.
     exact = scene_distance(centers) - radii
-    assert np.abs(clearance - exact).max() < RESOLUTION
-    assert np.median(np.abs(clearance - exact)) < 0.002
+    assert np.abs(found - exact).max() < RESOLUTION
+    assert np.median(np.abs(found - exact)) < 0.002
 
 
 def test_batches_equal_single_spheres_and_gradients_finite_differences(scene, field):
     centers, radii = spheres(12)
-    clearance = jax.jit(planning.sphere_clearance)
-    alone = jax.jit(planning.sphere_clearance_and_grad)
+    alone = jax.jit(partial(planning.sphere_clearance_and_grad, unknown="network"))
     for answering in (scene, field):
         value, gradient = alone(answering, centers.reshape(3, 4, 3), radii.reshape(3, 4))
         assert value.shape == (3, 4)
@@ -98,9 +83,9 @@ def test_batches_equal_single_spheres_and_gradients_finite_differences(scene, fi
         step = 1e-3
         for axis in range(3):
             shift = np.eye(3, dtype=np.float32)[axis] * step
-            up, down = (clearance(answering, centers + sign * shift, radii) for sign in (1, -1))
+            up, down = (CLEARANCE(answering, centers + sign * shift, radii) for sign in (1, -1))
             error = np.abs((up - down) / (2 * step) - gradient.reshape(12, 3)[:, axis])
-            assert np.sort(error)[-2] < 5e-3  # a step may cross the face of a cell
+            assert np.sort(error)[-2] < 5e-3  # a step may cross a cell boundary
 
 
 @settings(max_examples=10, deadline=None)
@@ -134,17 +119,17 @@ def test_swept_clearance_is_at_most_that_of_any_pose_between(scene, seed, evalua
     assert (swept <= least + 1e-5).all()
 
 
-def test_swept_clearance_is_tight_where_it_matters_and_tunnels_through_nothing():
-    # A sheet thinner than any sampling of the motion by 9 poses would see.
+def test_swept_clearance_does_not_tunnel_and_is_tight_near_surfaces():
+    # A sheet so thin that 9 poses along the motion miss it.
     sheet = (np.array([0.0, 0.0, 0.5]), np.array([0.01, 0.8, 0.4]))
-    scene = bake_function(lambda p: box_distance(p, *sheet))
+    scene = baked(lambda p: box_distance(p, *sheet), LOW, HIGH, RESOLUTION)
     start = np.tile(np.float32([-0.93, 0.1, 0.5]), (COUNT, 1))
     end = np.tile(np.float32([0.88, 0.13, 0.52]), (COUNT, 1))
     nothing = np.zeros(COUNT, np.float32)
     poses = start[0] + np.linspace(0, 1, 9)[:, None] * (end[0] - start[0])
-    assert planning.sphere_clearance(scene, poses, 0.0).min() > 0.01
+    assert clearance(scene, poses, 0.0).min() > 0.01
     assert SWEPT(scene, start, end, nothing)[0] <= -0.01 + 1e-6
-    # Past the sheet's edge: the least clearance is 3 cm, at one place on the way.
+    # Past the sheet's edge the least clearance is 3 cm, in one place.
     start, end = np.float32([-0.5, 0.85, 0.5]), np.float32([0.5, 0.85, 0.5])
     swept = [float(SWEPT(scene, start, end, 0.02, slope=1.0, evaluations=n)) for n in (2, 9, 33)]
     assert swept == sorted(swept)
@@ -152,22 +137,20 @@ def test_swept_clearance_is_tight_where_it_matters_and_tunnels_through_nothing()
     assert 0.025 < swept[-1] <= 0.03 + 1e-6
 
 
-def test_a_sphere_that_stays_has_the_clearance_of_its_pose(scene):
+def test_swept_clearance_at_rest_is_the_clearance(scene):
     centers, radii = spheres(COUNT)
     still = SWEPT(scene, centers, centers, radii)
     np.testing.assert_allclose(still, CLEARANCE(scene, centers, radii), atol=1e-6)
     assert np.isfinite(SLOPES(scene, centers, centers, radii)).all()
 
 
-def test_swept_clearance_in_vmap_and_its_gradient(scene, field):
+def test_swept_clearance_under_vmap_and_its_gradient(scene, field):
     starts, radii = spheres(COUNT, margin=-0.05)
     way = np.float32([0.31, -0.17, 0.12])
-    mapped = jax.jit(jax.vmap(planning.swept_clearance, (None, 0, 0, 0)))
+    arguments = [starts, starts + way, radii]
+    mapped = jax.jit(jax.vmap(swept_clearance, (None, 0, 0, 0)))(scene, *arguments)
+    np.testing.assert_allclose(mapped, SWEPT(scene, *arguments), atol=1e-5)
     for answering in (scene, field):
-        arguments = [starts, starts + way, radii]
-        np.testing.assert_allclose(
-            mapped(answering, *arguments), SWEPT(answering, *arguments), atol=1e-5
-        )
         gradients = SLOPES(answering, *arguments)
         step = 5e-4
         for argument, axis in ((0, 0), (1, 2)):
@@ -178,31 +161,31 @@ def test_swept_clearance_in_vmap_and_its_gradient(scene, field):
                 for sign in (1, -1)
             )
             error = np.abs((up - down) / (2 * step) - gradients[argument][:, axis])
-            assert np.quantile(error, 0.85) < 5e-3  # others have a kink within the step
+            assert np.quantile(error, 0.85) < 5e-3  # the others have a kink within the step
             assert np.abs(gradients[argument][:, axis]).max() > 0.1
 
 
-def test_swept_clearance_outside_jit_is_that_inside(scene):
+def test_swept_clearance_is_the_same_outside_jit(scene):
     starts, radii = spheres(COUNT)
     np.testing.assert_allclose(
-        planning.swept_clearance(scene, starts, -starts, radii),
+        swept_clearance(scene, starts, -starts, radii),
         SWEPT(scene, starts, -starts, radii),
         atol=1e-5,
     )
 
 
-def test_unseen_space_is_solid_where_asked(scene):
+def test_unseen_space_is_solid_by_default(scene):
     half_seen = scene.replace(frontier=jnp.full_like(scene.sdf, 0.05))
     centers, radii = np.array([[-0.7, 0.7, 0.8]], np.float32), 0.1
-    assert planning.sphere_clearance(half_seen, centers, radii)[0] > 0.3
+    assert clearance(half_seen, centers, radii)[0] > 0.3
     for answer in (
-        planning.sphere_clearance(half_seen, centers, radii, "obstacle"),
-        planning.swept_clearance(half_seen, centers, centers, radii, unknown="obstacle"),
+        planning.sphere_clearance(half_seen, centers, radii),
+        planning.swept_clearance(half_seen, centers, centers, radii),
     ):
         np.testing.assert_allclose(answer, [-0.05], atol=1e-6)
 
 
-def test_a_map_is_traced_and_a_sweep_compiles_once(scene):
+def test_a_map_is_a_traced_argument_of_a_sweep(scene):
     traces = []
 
     @jax.jit
@@ -232,14 +215,14 @@ def test_far_points_give_finite_answers(scene):
         assert np.isfinite(slopes).all()
 
 
-def test_collision_cost_is_that_of_chomp():
+def test_collision_cost_equals_chomps():
     margin = 0.3
     clearance = np.array([-2.0, -0.1, 0.0, 0.1, 0.3, 0.31, 5.0, np.inf])
     expected = [2.15, 0.25, 0.15, 0.2**2 / 0.6, 0, 0, 0, 0]
     np.testing.assert_allclose(planning.collision_cost(clearance, margin), expected, atol=1e-6)
     slopes = jax.vmap(jax.grad(lambda d: planning.collision_cost(d, margin)))(clearance)
     np.testing.assert_allclose(slopes, [-1, -1, -1, -2 / 3, 0, 0, 0, 0], atol=1e-6)
-    # Traced margins, one for each clearance.
+    # Traced margins, one per clearance.
     margins = jax.jit(planning.collision_cost)(jnp.zeros(3), jnp.array([0.1, 0.2, 0.4]))
     np.testing.assert_allclose(margins, [0.05, 0.1, 0.2], atol=1e-7)
 
@@ -260,13 +243,13 @@ def test_collision_cost_is_that_of_chomp():
         ({"unknown": "free"}, "unknown is 'free'"),
     ],
 )
-def test_bad_arguments_of_a_sweep_are_named(scene, arguments, words):
+def test_bad_arguments_of_a_sweep_are_refused(scene, arguments, words):
     good = {"start_world": np.zeros((3, 3)), "end_world": np.ones((3, 3)), "radii": 0.1}
     with pytest.raises(ValueError, match=words):
         planning.swept_clearance(scene, **(good | arguments))
 
 
-def test_bad_arguments_of_clearances_and_costs_are_named(scene):
+def test_bad_arguments_of_clearances_and_costs_are_refused(scene):
     for function in (planning.sphere_clearance, planning.sphere_clearance_and_grad):
         with pytest.raises(ValueError, match=r"radii.*-1"):
             function(scene, np.zeros((2, 3)), [0, -1])

@@ -1,4 +1,4 @@
-"""The Panda of frax: where its spheres are, its clearance and gradient, a filter that guards it."""
+"""frax's Panda: its spheres, its clearance and gradient, and a filter that guards it."""
 
 import warnings
 
@@ -14,15 +14,11 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import frax
 
-    from hiosdf_jax._src.planning.adapters.cbf import velocity_filter
+    from hiosdf_jax.planning import cbf
 
-from hiosdf_jax._src.planning.adapters.frax import (
-    arm_clearance,
-    arm_clearance_and_grad,
-    arm_spheres,
-)
+from hiosdf_jax import planning
 
-# Denavit-Hartenberg parameters as Franka publishes them (Craig's convention): a m, d m, alpha rad.
+# Denavit-Hartenberg parameters as published by Franka (Craig's convention): a m, d m, alpha rad.
 TURN = np.pi / 2
 DH = [
     (0, 0.333, 0),
@@ -53,13 +49,13 @@ def reference_spheres(panda, q):
 
 
 def reference_clearances(panda, q, exact):
-    """Of all spheres, (S,) m."""
+    """Clearances of all spheres, (S,) m."""
     return exact(reference_spheres(panda, q)) - np.concatenate(panda.collision_radii)
 
 
-def test_spheres_are_where_the_kinematics_of_the_manufacturer_put_them(panda):
+def test_spheres_are_where_the_manufacturers_kinematics_put_them(panda):
     q = example.draw(panda, 30, np.random.default_rng(0))
-    centers, radii = arm_spheres(panda, q.reshape(5, 6, 7), BASE)
+    centers, radii = planning.frax.arm_spheres(panda, q.reshape(5, 6, 7), BASE)
     assert centers.shape == (5, 6, 21, 3)
     expected = np.array([reference_spheres(panda, row) for row in q])
     np.testing.assert_allclose(centers.reshape(30, 21, 3), expected, atol=1e-4)
@@ -67,10 +63,10 @@ def test_spheres_are_where_the_kinematics_of_the_manufacturer_put_them(panda):
 
 
 def test_clearance_and_gradient_of_200_maps_with_one_compilation(panda):
-    counted, traces = count_traces(arm_clearance_and_grad)
+    counted, traces = count_traces(planning.frax.arm_clearance_and_grad)
     cost = jax.jit(counted, static_argnums=1)
     q = example.draw(panda, 200, np.random.default_rng(1))
-    q[1::2] = q[::2]  # From one step to the next the map alone changes.
+    q[1::2] = q[::2]  # Between the steps of a pair only the map changes.
     normals, offsets, fields = half_spaces(200)
     clearances, checked = np.zeros(200), 0
     for k, (normal, offset, field) in enumerate(zip(normals, offsets, fields, strict=True)):
@@ -95,7 +91,10 @@ def test_clearance_and_gradient_of_200_maps_with_one_compilation(panda):
     assert len(traces) == 1
     assert checked == 60
     assert (
-        equalities_with_least(lambda q: arm_clearance(fields[0], panda, q), jnp.asarray(q[0])) == 0
+        equalities_with_least(
+            lambda q: planning.frax.arm_clearance(fields[0], panda, q), jnp.asarray(q[0])
+        )
+        == 0
     )
     assert (np.abs(clearances[::2] - clearances[1::2]) > 0.01).mean() > 0.9
 
@@ -109,12 +108,12 @@ def test_4096_configurations_in_a_furnished_room(panda):
     assert np.isfinite(value).all()
     assert np.isfinite(gradient).all()
     expected = np.array([reference_clearances(panda, row, exact_sdf).min() for row in q])
-    # In solids the scene's distances are bounds; the lattice rounds edges off by a third of 5 cm.
+    # Inside solids the scene's distances are bounds. The lattice rounds edges by a third of 5 cm.
     free = expected > 0
     assert 400 < free.sum() < 3700
     np.testing.assert_allclose(value[free], expected[free], atol=0.02)
     assert np.abs(value - expected)[free].mean() < 2e-3
-    alone = [float(arm_clearance(field, panda, row, BASE)) for row in q[:3]]
+    alone = [float(planning.frax.arm_clearance(field, panda, row, BASE)) for row in q[:3]]
     np.testing.assert_allclose(value[:3], alone, atol=1e-5)
 
 
@@ -129,11 +128,11 @@ def test_the_gradient_leads_out_of_collision(panda):
 
 
 def test_a_filter_guards_the_whole_arm(panda):
-    """The same filter as for a ball, over all 21 spheres: joints run for where the arm may not."""
+    """The filter over all 21 spheres, with joint goals in collision."""
     field = baked(exact_sdf, ROOM[0] - 0.5, ROOM[1] + 0.5, 0.05)
-    # In 20 ms the farthest sphere travels some 2 cm; the lattice errs by 1 cm.
-    safe = velocity_filter(
-        lambda q: arm_spheres(panda, q, BASE), [0.6] * 7, margin_m=0.05, unknown="obstacle"
+    # In 20 ms the farthest sphere travels about 2 cm; the lattice errs by 1 cm.
+    safe = cbf.velocity_filter(
+        lambda q: planning.frax.arm_spheres(panda, q, BASE), [0.6] * 7, margin_m=0.05
     )
     q = example.draw(panda, 400, np.random.default_rng(4))
     exact = np.array([reference_clearances(panda, row, exact_sdf).min() for row in q])
@@ -159,11 +158,11 @@ def test_a_filter_guards_the_whole_arm(panda):
     assert run(filtered=True).min() > 0.0
 
 
-def test_bad_arguments_are_named(panda):
+def test_bad_arguments_are_refused(panda):
     field = half_space([0, 0, 1.0], 0.0)
     with pytest.raises(ValueError, match=r"q has shape \(6,\), expected \(..., 7\)"):
-        arm_clearance(field, panda, np.zeros(6))
+        planning.frax.arm_clearance(field, panda, np.zeros(6))
     with pytest.raises(ValueError, match=r"pose_world_base has shape \(3, 4\)"):
-        arm_clearance(field, panda, np.zeros(7), np.zeros((3, 4)))
+        planning.frax.arm_clearance(field, panda, np.zeros(7), np.zeros((3, 4)))
     with pytest.raises(ValueError, match="unknown"):
-        arm_clearance(field, panda, np.zeros(7), None, "space")
+        planning.frax.arm_clearance(field, panda, np.zeros(7), None, "space")

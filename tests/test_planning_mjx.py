@@ -1,4 +1,4 @@
-"""Rollouts in MJX: the same motions as MuJoCo's, and a planner compiled once for many maps."""
+"""Rollouts in MJX: MuJoCo's motions, and a planner compiled once for many maps."""
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,9 @@ from analytic import baked
 from mujoco import mjx
 from scene import ROOM, exact_sdf
 
-from hiosdf_jax._src.planning.adapters.mjx import rollout, sphere_geoms
+from hiosdf_jax import planning
 
-ROVER = (example.ROVER, 1024, example.HORIZON)
+ROVER = (example.ROVER, 256, example.HORIZON)
 ARM = (example.ARM, 16, 4)  # its steps take ten times as long
 BOX = (ROOM[0] - 0.2, ROOM[1] + 0.2, 0.1)  # corners and resolution of all maps, m
 
@@ -38,7 +38,7 @@ CART = """
 
 
 def simulate(model, qpos, controls, geoms):
-    """The same by MuJoCo in float64: positions (H, nq) and centers of the balls (H, S, 3)."""
+    """Simulates in MuJoCo, float64: positions (H, nq) and centers of the balls (H, S, 3)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     states, centers = [], []
@@ -56,14 +56,14 @@ def random_controls(model, shape, seed):
     return np.random.default_rng(seed).uniform(low, high, (*shape, model.nu)).astype(np.float32)
 
 
-def test_motions_are_those_of_mujoco():
+def test_motions_equal_mujocos():
     model = mujoco.MjModel.from_xml_string(CART)
-    geoms, radii = sphere_geoms(model)
+    geoms, radii = planning.mjx.sphere_geoms(model)
     np.testing.assert_array_equal(geoms, [1, 3])
     np.testing.assert_allclose(radii, [0.1, 0.05])
     controls = random_controls(model, (2, 3, 6), 0)
     data = mjx.make_data(model).replace(qpos=jnp.array([0.1, 0.2]))
-    run = jax.jit(lambda m, d, c: rollout(m, d, c, geoms, example.HOLD))
+    run = jax.jit(lambda m, d, c: planning.mjx.rollout(m, d, c, geoms, example.HOLD))
     future = run(mjx.put_model(model), data, controls)
     assert future.qvel.shape == (2, 3, 6, 2)
     for index in np.ndindex(2, 3):
@@ -87,7 +87,7 @@ def test_200_steps_with_200_maps_compile_once_and_the_cost_reacts(task, rollouts
     plan = example.make_planner(model, task.goal_world, rollouts)
     rng = np.random.default_rng(2)
     means = random_controls(model, (200, horizon), 1)
-    means[1::2] = means[::2]  # From one step to the next the map alone changes.
+    means[1::2] = means[::2]  # Between the steps of a pair only the map changes.
     qpos, rest = jnp.array(task.qpos), jnp.zeros(model.nv)
     costs, compared = np.zeros(200), 0
     for k in range(200):
@@ -103,12 +103,12 @@ def test_200_steps_with_200_maps_compile_once_and_the_cost_reacts(task, rollouts
         assert np.isfinite(better).all()
         if k < 60:
             expected, clearance = reference_cost(task, model, task.qpos, means[k], exact)
-            # A ball that just touches collides in one simulator and not in the other.
+            # A ball that just touches may collide in one simulator only.
             if np.abs(clearance).min() > 1e-3:
                 np.testing.assert_allclose(cost, expected, rtol=2e-3, atol=0.05)
                 compared += 1
     assert compared > 30
-    # Some pairs of maps are both free of collisions, and cost the same.
+    # Pairs of maps without collisions cost the same.
     assert (np.abs(costs[::2] - costs[1::2]) > 1.0).mean() > 0.3
     if task is example.ROVER:
         distance, clearance = example.drive(task, model, plan, baked(exact_sdf, *BOX))
@@ -117,12 +117,12 @@ def test_200_steps_with_200_maps_compile_once_and_the_cost_reacts(task, rollouts
     assert plan._cache_size() == 1
 
 
-def test_bad_arguments_are_named():
+def test_bad_arguments_are_refused():
     model = example.load(example.ROVER)
     robot, data = mjx.put_model(model), mjx.make_data(model)
     with pytest.raises(ValueError, match=r"controls has shape \(4, 2\), expected \(..., H, 3\)"):
-        rollout(robot, data, jnp.zeros((4, 2)), np.array([0]))
+        planning.mjx.rollout(robot, data, jnp.zeros((4, 2)), np.array([0]))
     with pytest.raises(ValueError, match="steps_per_control is 0"):
-        rollout(robot, data, jnp.zeros((4, 3)), np.array([0]), 0)
+        planning.mjx.rollout(robot, data, jnp.zeros((4, 3)), np.array([0]), 0)
     with pytest.raises(ValueError, match="expected spheres"):
-        sphere_geoms(mujoco.MjModel.from_xml_string("<mujoco/>"))
+        planning.mjx.sphere_geoms(mujoco.MjModel.from_xml_string("<mujoco/>"))

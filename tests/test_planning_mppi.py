@@ -4,32 +4,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import baked
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.state import Baked
 
 jax_mppi = pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
-mppi = pytest.importorskip("hiosdf_jax._src.planning.adapters.mppi")
+from hiosdf_jax.planning import mppi
 
 RADIUS = 0.3  # m, of the robot
 STEP = 0.1  # s
 GOAL = jnp.array([2.0, 0.0, 0.0])
 
 
-def ball_world(centre, radius, updates=0):
-    """A baked map of one ball, everything seen: (61, 41, 3) samples over x, y, z."""
-    corner, resolution = np.array([-1.0, -2.0, -0.1], np.float32), 0.1
-    index = np.indices((61, 41, 3)).transpose(1, 2, 3, 0)
-    points = corner + resolution * index
-    sdf = (np.linalg.norm(points - np.asarray(centre), axis=-1) - radius).astype(np.float32)
-    return Baked(
-        corner_world=jnp.asarray(corner),
-        resolution=jnp.float32(resolution),
-        sdf=jnp.asarray(sdf),
-        frontier=jnp.full(sdf.shape, 1.0, jnp.float32),
-        lower=jnp.asarray(sdf - 0.02),
-        updates=jnp.int32(updates),
-        stamp=jnp.float32(0),
+def ball_world(center, radius):
+    """A map of one ball, all of it observed: 61 x 41 x 3 samples."""
+    return baked(
+        lambda p: np.linalg.norm(p - np.asarray(center), axis=-1) - radius,
+        (-1.0, -2.0, -0.1),
+        (5.0, 2.0, 0.1),
+        0.1,
     )
 
 
@@ -38,7 +31,7 @@ def drive(state, control):
 
 
 def clear_of(field, state, control):
-    depth = jax.nn.relu(RADIUS - hio.sdf(field, state, unknown="obstacle"))
+    depth = jax.nn.relu(RADIUS - hio.sdf(field, state))
     return 1000.0 * depth + 10.0 * jnp.sum((state - GOAL) ** 2)
 
 
@@ -55,7 +48,7 @@ def make(samples=256, horizon=15):
     )
 
 
-def test_two_hundred_maps_are_one_compilation_and_each_counts_at_once():
+def test_200_maps_compile_once_and_each_takes_effect_at_once():
     settings, plan = make(samples=64, horizon=8)
     traces = 0
 
@@ -65,22 +58,22 @@ def test_two_hundred_maps_are_one_compilation_and_each_counts_at_once():
         return clear_of(field, state, control)
 
     command = mppi.controller(settings, drive, counted)
-    # A ball to the left at odd steps, to the right at even ones, never twice in the same place. The
-    # nominal plan and the noise are always the same: only the map differs.
+    # A ball alternately right and left, never twice in the same place. Nominal plan and noise stay
+    # the same: only the map differs.
     sides = np.where(np.arange(200) % 2, 1, -1)
     answers = np.empty(200)
     for k, side in enumerate(sides):
-        world = ball_world((0.2 + 0.0005 * k, side * 0.4, 0.0), 0.3, k)
+        world = ball_world((0.2 + 0.0005 * k, side * 0.4, 0.0), 0.3)
         control, _ = command(plan, jnp.zeros(3), world)
         answers[k] = control[1]
     assert traces == 1
-    # Each answer evades the ball of its own step, not that of the step before.
+    # Each control evades the ball of its own step, not that of the step before.
     np.testing.assert_array_equal(np.sign(answers), -sides)
     assert np.abs(answers).min() > 0.05
 
 
-def test_the_cost_is_that_of_the_map_given():
-    """The same controls, costed by jax-mppi through the adapter and by hand."""
+def test_the_cost_is_that_of_the_given_map():
+    """The same controls, costed through the adapter and by hand."""
     settings, plan = make(samples=1, horizon=4)
     seen = []
 
@@ -101,16 +94,16 @@ def test_the_cost_is_that_of_the_map_given():
             assert cost == pytest.approx(by_hand, abs=1000 * 0.012)  # interpolation at 10 cm
 
 
-def test_a_robot_drives_around_a_ball_that_moves_into_its_way():
+def test_a_robot_drives_around_a_ball_that_moves_into_its_path():
     settings, plan = make()
     command = mppi.controller(settings, drive, clear_of, lambda f, s, u: 20 * clear_of(f, s, u))
     state, gaps = jnp.zeros(3), []
     for k in range(60):
         # The ball crosses the straight line to the goal from the left and stays on it.
-        centre = np.array([1.0, max(1.0 - 0.05 * k, 0.1), 0.0])
-        control, plan = command(plan, state, ball_world(centre, 0.3))
+        center = np.array([1.0, max(1.0 - 0.05 * k, 0.1), 0.0])
+        control, plan = command(plan, state, ball_world(center, 0.3))
         state = drive(state, control)
-        gaps.append(np.linalg.norm(np.asarray(state) - centre) - 0.3)
+        gaps.append(np.linalg.norm(np.asarray(state) - center) - 0.3)
     assert np.linalg.norm(np.asarray(state - GOAL)) < 0.15
     assert min(gaps) > RADIUS - 0.03
 

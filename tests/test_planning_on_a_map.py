@@ -1,4 +1,4 @@
-"""The controllers on maps that grow scan by scan: compiled once, and right about what was seen."""
+"""Controllers on maps that grow scan by scan: compiled once, and right where the map has seen."""
 
 import itertools
 import warnings
@@ -14,28 +14,18 @@ import trajectory
 from analytic import count_traces
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.demo.sensing import map_config
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import frax
 
-# Enough for a map whose grid is right; the network has a tenth of the say.
-SMALL = {
-    "hidden_width": 16,
-    "near_samples": 400,
-    "far_samples": 1000,
-    "local_points": 20,
-    "batches": 1,
-    "warmup_epochs": 1,
-}
-
 
 @pytest.fixture(scope="module")
 def fields():
     """Snapshots after each of the scans."""
-    bounds = (scene.ROOM[0] - 0.2, scene.ROOM[1] + 0.2)
-    config = hio.Config.light(bounds, max_points=8000, **SMALL)
-    state, rng = hio.init(config, jax.random.key(0)), np.random.default_rng(0)
+    # The room fits into the exploring robot's map, whose update other tests compile too.
+    state, rng = hio.init(map_config(), jax.random.key(0)), np.random.default_rng(0)
     snapshots = []
     for position in scene.VIEWPOINTS:
         state = hio.update(state, *scene.scan(np.array(position), 8000, rng))
@@ -53,7 +43,7 @@ def test_clearance_of_the_panda(fields):
     assert np.isfinite(values[-1][1]).all()
 
 
-def test_the_filter_and_the_reckless_robot(fields):
+def test_the_filter_stops_the_reckless_robot(fields):
     simulate = safety_filter.make_simulator(steps=40)
     rng = np.random.default_rng(0)
     collisions = []
@@ -72,11 +62,11 @@ def test_trajectories_improve_as_the_map_grows(fields):
     paths = [trajectory.plan(f, start, goal, key, count=8) for f in (fields[0], fields[-1])]
     assert trajectory.plan._cache_size() == before + 1
     assert paths[-1].clearance > 0.05
-    assert paths[0].clearance < 0  # The goal had not been seen.
+    assert paths[0].clearance < 0  # The goal is unseen.
     assert trajectory.exact_clearance(paths[-1].waypoints_world) > 0.02
 
 
-def test_a_jitted_function_that_takes_the_map_traces_once(fields):
+def test_a_jitted_function_of_the_map_traces_once(fields):
     counted, traces = count_traces(hio.sdf)
     cost = jax.jit(counted)
     points = np.random.default_rng(0).uniform(*scene.ROOM, (100, 3)).astype(np.float32)

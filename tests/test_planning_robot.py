@@ -1,7 +1,4 @@
-"""A model's geoms as spheres: complete, protruding little; placed as MuJoCo places the geoms."""
-
-import subprocess
-import sys
+"""A robot as spheres: complete covers that protrude little, placed as MuJoCo places the geoms."""
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
-from analytic import equalities_with_least
+from analytic import equalities_with_least, half_space
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco import mjx
 
 from hiosdf_jax import planning
 from hiosdf_jax._src.planning.robot import cover, solids
-from hiosdf_jax._src.state import Baked
 from hiosdf_jax.demo import signed_distance
 
 TOLERANCE = 0.03
@@ -70,7 +66,7 @@ def spheres(model):
 
 
 def exact_distance(name, geom_xml):
-    """Signed distance to a geom in its own frame, by code that the covers do not use."""
+    """Signed distance to a geom in its own frame, by code independent of the covers."""
     if geom_xml is not None:
         alone = mujoco.MjModel.from_xml_string(
             f"<mujoco><worldbody>{geom_xml}</worldbody></mujoco>"
@@ -86,7 +82,7 @@ def exact_distance(name, geom_xml):
 
 
 def distance_to_convex(solid, points):
-    """Signed distance by all planes and, outside, the closest points of all triangles."""
+    """Signed distance by all face planes and, outside, the closest points of all triangles."""
     heights = points @ solid.face_normals.T - np.sum(
         solid.face_normals * solid.triangles[:, 0], axis=1
     )
@@ -101,7 +97,7 @@ def distance_to_convex(solid, points):
     return value
 
 
-GEOMS = {  # as in ARM, at the origin; at most so many spheres
+GEOMS = {  # as in ARM, at the origin; largest number of spheres
     "stand": ("<geom type='cylinder' size='.08 .15'/>", 25),
     "bone": (f"<geom type='capsule' size='.04 {np.hypot(0.3, 0.1) / 2}'/>", 4),
     "beam": ("<geom type='box' size='.15 .03 .05'/>", 12),
@@ -116,7 +112,7 @@ def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, n
     geom, spheres = model.geom(name), alone[name]
     xml, most = GEOMS[name]
     distance = exact_distance(name, xml)
-    # Back in the geom's own frame, by MuJoCo's arithmetic.
+    # Back to the geom's own frame, by MuJoCo's arithmetic.
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, geom.quat)
     centers = (np.asarray(spheres.centers_body, float) - geom.pos) @ rotation.reshape(3, 3)
@@ -124,7 +120,7 @@ def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, n
     assert (spheres.body == geom.bodyid[0]).all()
     assert len(radii) <= most
 
-    # Dense points in the solid, and on it: those, moved out to its surface by bisection.
+    # Dense points inside the solid, and points moved out to its surface by bisection.
     rng = np.random.default_rng(0)
     box = model.geom_aabb[geom.id]
     low, high = box[:3] - box[3:], box[:3] + box[3:]
@@ -147,7 +143,7 @@ def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, n
     room = np.linalg.norm(covered[:, None] - centers, axis=2) - radii
     assert room.min(axis=1).max() <= 1e-6
 
-    # Dense points on the spheres are hardly farther from the solid than the tolerance.
+    # Dense points on the spheres are within the tolerance of the solid.
     directions = trimesh.creation.icosphere(3).vertices
     outline = (centers[:, None] + radii[:, None, None] * directions).reshape(-1, 3)
     farthest = distance(outline[:: max(1, len(outline) // 2000)]).max()
@@ -156,7 +152,7 @@ def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, n
 
 
 def test_bodies_and_geoms_are_chosen_by_name_or_id(model, alone, spheres):
-    # All colliding geoms but the world's, in their order: neither the floor nor "look".
+    # By default all colliding geoms but the world's, in order: neither the floor nor "look".
     together = jax.tree.map(lambda *parts: np.concatenate(parts), *alone.values())
     jax.tree.map(np.testing.assert_array_equal, spheres, together)
     assert [leaf.dtype for leaf in jax.tree.leaves(spheres)] == [
@@ -173,7 +169,7 @@ def test_bodies_and_geoms_are_chosen_by_name_or_id(model, alone, spheres):
     jax.tree.map(np.testing.assert_array_equal, by_id, alone["bone"])
 
 
-def test_a_model_of_mjx_gives_the_same_spheres(model, alone):
+def test_an_mjx_model_gives_the_same_spheres(model, alone):
     found = planning.spheres_from_model(mjx.put_model(model), TOLERANCE, bodies=["upper", "hand"])
     expected = jax.tree.map(
         lambda *parts: np.concatenate(parts), *(alone[name] for name in ("bone", "ball", "finger"))
@@ -196,7 +192,7 @@ def test_a_model_of_mjx_gives_the_same_spheres(model, alone):
         ({"tolerance_m": float("nan")}, "tolerance_m is nan"),
     ],
 )
-def test_bad_choices_are_named(model, arguments, words):
+def test_bad_choices_are_refused(model, arguments, words):
     with pytest.raises(ValueError, match=words):
         planning.spheres_from_model(model, **({"tolerance_m": TOLERANCE} | arguments))
 
@@ -205,7 +201,7 @@ def test_bad_choices_are_named(model, arguments, words):
 @given(st.floats(0.005, 0.3), st.floats(0, 1), st.floats(0.003, 0.1))
 def test_rows_of_spheres_cover_any_capsule(radius, half_length, tolerance):
     centers, radii = cover.cover_capsule(radius, half_length, tolerance)
-    # On the axis, so that a sphere protrudes as much as it is larger than the capsule.
+    # On the axis a sphere protrudes by the difference of the radii.
     assert (centers[:, :2] == 0).all()
     assert (np.abs(centers[:, 2]) <= half_length).all()
     assert (radii <= radius + tolerance + 1e-12).all()
@@ -215,11 +211,11 @@ def test_rows_of_spheres_cover_any_capsule(radius, half_length, tolerance):
     out = np.concatenate([np.full(2000, radius), radius * np.sin(angle)])
     room = np.hypot(out[:, None], z[:, None] - centers[:, 2]) - radii
     assert room.min(axis=1).max() <= 1e-9
-    # No larger than needed: the cover touches the outline between two spheres and at the ends.
+    # No larger than needed: the cover touches the outline between spheres and at the ends.
     assert room.min(axis=1)[-200:].max() >= -1e-9
     if len(radii) > 1:
         assert room.min(axis=1)[:2000].max() >= -1e-3
-    # One sphere fewer could not do, at the largest radius allowed.
+    # With one sphere fewer the largest allowed radius would not suffice.
     if len(radii) > 1:
         reach = np.sqrt((radius + tolerance) ** 2 - radius**2)
         assert 2 * (half_length - tolerance) > (len(radii) - 2) * 2 * reach - 1e-9
@@ -243,7 +239,7 @@ def test_lattices_of_spheres_cover_any_box(half, tolerance):
     assert room.min(axis=1).max() <= 1e-9
 
 
-def test_the_distance_to_an_ellipsoid_is_that_to_a_fine_mesh_of_it():
+def test_the_distance_to_an_ellipsoid_equals_that_to_a_fine_mesh():
     solid = trimesh.creation.icosphere(4)
     solid.apply_scale(EGG)
     rng = np.random.default_rng(1)
@@ -264,7 +260,7 @@ def test_the_bounds_of_the_distance_to_a_mesh_hold():
     assert (least <= exact + 1e-9).all()
     assert (exact <= greatest + 1e-9).all()
     assert (greatest - least).max() < 0.5 * TOLERANCE
-    # Without one face it encloses nothing: a sheet, no point of which is inside.
+    # Without one face it encloses nothing: no point is inside a sheet.
     _, greatest = solids.mesh(vertices, faces[1:], TOLERANCE)(points)
     assert (greatest >= 0).all()
 
@@ -273,7 +269,7 @@ def test_the_hole_of_a_ring_stays_open():
     ring = trimesh.creation.torus(0.12, 0.03, major_sections=64, minor_sections=32)
     vertices, faces = np.asarray(ring.vertices), np.asarray(ring.faces)
 
-    def distance(points):  # of the torus that the mesh is inscribed in, by at most 0.3 mm
+    def distance(points):  # of the torus around the mesh, at most 0.3 mm away
         radial = np.hypot(points[:, 0], points[:, 1]) - 0.12
         return np.hypot(radial, points[:, 2]) - 0.03
 
@@ -286,22 +282,6 @@ def test_the_hole_of_a_ring_stays_open():
     room = np.linalg.norm(points[:, None] - centers, axis=2) - radii
     assert room.min(axis=1).max() <= 1e-9
     assert len(radii) <= 20
-
-
-def slanted(normal, offset):
-    """A field that is linear, so that interpolation is exact, over a box of 6 m."""
-    axis = np.linspace(-3, 3, 13)
-    values = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1) @ normal + offset
-    values = jnp.asarray(values, jnp.float32)
-    return Baked(
-        corner_world=jnp.full(3, -3.0),
-        resolution=jnp.float32(0.5),
-        sdf=values,
-        frontier=jnp.full_like(values, 10.0),
-        lower=values,
-        updates=jnp.int32(1),
-        stamp=jnp.float32(0),
-    )
 
 
 NORMAL, OFFSET = np.array([0.48, -0.6, 0.64]), 0.5
@@ -323,18 +303,17 @@ def test_spheres_are_placed_where_mujoco_has_the_bodies(model, spheres):
     for joints in CONFIGURATIONS[:2]:
         expected, data = mujoco_centers(model, spheres, joints)
         np.testing.assert_allclose(planning.place_spheres(spheres, data), expected, atol=1e-6)
-    # The world's frame moved by any rigid motion moves them all.
     poses = planning.BodyPoses(np.stack([data.xpos] * 2), np.stack([data.xmat] * 2))
     placed = jax.jit(planning.place_spheres)(spheres, poses)
     np.testing.assert_allclose(placed, np.stack([expected] * 2), atol=1e-6)
-    # The ball's center is where MuJoCo has that geom.
+    # The ball's center is where MuJoCo has the geom.
     ball = np.asarray(spheres.radii) == np.float32(0.06)
     assert ball.sum() == 1
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.geom("ball").xpos, np.asarray(placed)[0, ball][0], atol=1e-6)
 
 
-def test_a_robots_clearance_and_its_gradient_through_mjx(model, spheres):
+def test_robot_clearance_and_its_gradient_through_mjx(model, spheres):
     moving = np.asarray(spheres.body) > model.body("base").id
     spheres = jax.tree.map(lambda array: array[moving], spheres)
     simulated = mjx.put_model(model)
@@ -344,7 +323,7 @@ def test_a_robots_clearance_and_its_gradient_through_mjx(model, spheres):
         data = mjx.kinematics(simulated, start.replace(qpos=joints))
         return planning.robot_clearance(field, spheres, data)
 
-    field = slanted(NORMAL, OFFSET)
+    field = half_space(NORMAL, OFFSET)
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(clearance, 1), (None, 0)))(
         field, CONFIGURATIONS
     )
@@ -366,7 +345,7 @@ def test_a_robots_clearance_and_its_gradient_through_mjx(model, spheres):
     assert equalities_with_least(lambda q: clearance(field, q), jnp.asarray(CONFIGURATIONS[0])) == 0
 
 
-def test_bad_poses_are_named(model, spheres):
+def test_bad_poses_are_refused(model, spheres):
     xpos, xmat = np.zeros((5, 3)), np.zeros((5, 3, 3))
     for poses, words in (
         (planning.BodyPoses(xpos[:3], xmat[:3]), "3 bodies, expected more than 4"),
@@ -375,18 +354,3 @@ def test_bad_poses_are_named(model, spheres):
     ):
         with pytest.raises(ValueError, match=words):
             planning.place_spheres(spheres, poses)
-
-
-def test_planning_imports_without_simulator_and_mesh_library():
-    code = """
-import sys
-class Refuse:
-    def find_spec(self, name, *_):
-        if name.split(".")[0] in ("mujoco", "trimesh"):
-            raise ImportError(name)
-sys.meta_path.insert(0, Refuse())
-from hiosdf_jax import planning
-assert "scipy.spatial" not in sys.modules
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

@@ -31,9 +31,9 @@ from hiosdf_jax._src.planning.adapters import mppi
 _ROUNDING = 1e-5  # m, of a distance
 
 # Costs per control step; jax-mppi's own cost of the noise is about 1 per step.
-_PER_METRE_TO_GO = 30.0
-_PER_METRE_NEAR = 100.0
-_PER_METRE_TOO_NEAR = 3000.0
+_PER_METER_TO_GO = 30.0
+_PER_METER_NEAR = 100.0
+_PER_METER_TOO_NEAR = 3000.0
 _FACING_AWAY = 8.0
 
 
@@ -107,9 +107,9 @@ def make_driver(
         gap = clearance(robot, task.field, state, unknown)
         heading = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
         return (
-            _PER_METRE_TO_GO * _interpolate(task, state[:2])
-            + _PER_METRE_NEAR * jax.nn.relu(robot.comfort - gap)
-            + _PER_METRE_TOO_NEAR * jax.nn.relu(robot.margin - gap)
+            _PER_METER_TO_GO * _interpolate(task, state[:2])
+            + _PER_METER_NEAR * jax.nn.relu(robot.comfort - gap)
+            + _PER_METER_TOO_NEAR * jax.nn.relu(robot.margin - gap)
             + _FACING_AWAY * (1 - jnp.dot(heading, task.heading))
         )
 

@@ -31,8 +31,7 @@ from hiosdf_jax._src.state import Field
 
 # A body 0.4 m wide, from 0.15 m to 1.25 m above the floor.
 ROBOT = Robot(heights=(0.35, 0.49, 0.63, 0.77, 0.91, 1.05))
-REACHED = 0.25  # m from the goal
-
+_REACHED = 0.25  # m from the goal
 _CELL = 0.1  # m, of the geodesic's plane
 
 # When the robot looks around, the camera nods: otherwise it never sees what is overhead nearby.
@@ -139,7 +138,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
         state = jnp.asarray(moved[-1])
         states.append(moved[-1])
         passed.append(moved[:, :2])
-        reached = bool(np.linalg.norm(moved[-1, :2] - problem.goal) < REACHED)
+        reached = bool(np.linalg.norm(moved[-1, :2] - problem.goal) < _REACHED)
         if reached:
             break
         if watch.looked_in_vain(moved[-1]):

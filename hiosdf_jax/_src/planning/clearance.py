@@ -1,4 +1,4 @@
-"""How far spheres are from collision."""
+"""Clearance of spheres."""
 
 from __future__ import annotations
 
@@ -13,18 +13,23 @@ from hiosdf_jax._src.field.points import AnyField, Unknown, sdf, sdf_and_grad
 
 
 def sphere_clearance(
-    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "network"
+    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
 ) -> jax.Array:
-    """Signed distance of spheres to the nearest surface: sdf(center) - radius.
+    """Computes the signed distance of spheres to the nearest surface: sdf(center) - radius.
+
+    Example:
+        centers_world = jnp.array([[0.5, 0.0, 0.3], [0.7, 0.0, 0.3]])
+        clearance = planning.sphere_clearance(field, centers_world, radii=0.1)
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
         centers_world: (..., 3) m.
         radii: m, >= 0; any shape that broadcasts to that of the spheres, (...).
-        unknown: As for `sdf`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
-        (...) float32, m; negative by the depth of the penetration. Differentiable.
+        (...) float32, m; negative in collision, by the depth of penetration. Differentiable.
 
     Raises:
         ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
@@ -34,15 +39,16 @@ def sphere_clearance(
 
 
 def sphere_clearance_and_grad(
-    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "network"
+    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
 ) -> tuple[jax.Array, jax.Array]:
-    """Clearance of spheres and its gradient, by one backward pass for the whole batch.
+    """Computes the clearance of spheres and its gradient, by one backward pass for the batch.
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
         centers_world: (..., 3) m.
         radii: As for `sphere_clearance`.
-        unknown: As for `sdf`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
         The clearance (...) float32, m, and d(clearance)/d(center), (..., 3) float32.
@@ -61,7 +67,7 @@ def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
     Args:
         radii: m.
         centers: (..., 3) m.
-        name: What the caller calls the centers.
+        name: The caller's name for the centers.
 
     Returns:
         The radii, float32.
@@ -77,11 +83,11 @@ def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
         wrong = ~((values >= 0) & np.isfinite(values))
         if wrong.any():
             raise ValueError(
-                f"radii has {wrong.sum()} negative or not finite values, expected all >= 0: "
+                f"radii has {wrong.sum()} negative or non-finite values, expected all >= 0: "
                 f"{values[wrong][:5].tolist()} at {np.argwhere(wrong)[:5].tolist()}"
             )
     radii = jnp.asarray(radii, jnp.float32)
-    # Radii that enlarge the batch are a mistake: each sphere has one.
+    # Radii must not enlarge the batch: each sphere has one.
     dimensions = zip(radii.shape[::-1], shape[-2::-1], strict=False)
     if radii.ndim >= len(shape) or any(own not in (1, batch) for own, batch in dimensions):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What a trajectory pays for being close to surfaces."""
+"""Cost of being close to surfaces."""
 
 from __future__ import annotations
 
@@ -11,26 +11,33 @@ import numpy as np
 
 
 def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
-    """The obstacle cost of CHOMP (Zucker et al., IJRR 2013): smooth, zero beyond a margin.
+    """Computes the obstacle cost of CHOMP (Zucker et al., IJRR 2013), zero beyond a margin.
 
-    With the clearance d and the margin e: e / 2 - d where d < 0, (e - d)^2 / (2 e) where
+    For clearance d and margin e the cost is e / 2 - d where d < 0, (e - d)^2 / (2 e) where
     0 <= d <= e, and 0 beyond. Value and slope are continuous; the slope is -1 in collision.
 
+    Example:
+        def cost(field, centers_world):
+            clearance = planning.sphere_clearance(field, centers_world, radii=0.1)
+            return planning.collision_cost(clearance, margin_m=0.2).sum()
+
+        gradient = jax.grad(cost, argnums=1)(field, jnp.zeros((5, 3)))
+
     Args:
-        clearance: (...) m, as from `sphere_clearance`.
+        clearance: (...) m, see `sphere_clearance`.
         margin_m: m, > 0; any shape that broadcasts with the clearance.
 
     Returns:
         (...) m. Differentiable.
 
     Raises:
-        ValueError: The margin is not positive (outside jit).
+        ValueError: (Outside jit) the margin is not positive and finite.
     """
     if not isinstance(margin_m, jax.core.Tracer):
         values = np.asarray(margin_m, float)
         if not ((values > 0) & np.isfinite(values)).all():
             raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite")
     clearance, margin = jnp.asarray(clearance, jnp.float32), jnp.asarray(margin_m, jnp.float32)
-    # Clipped before it is squared: an infinite clearance must not make the gradient NaN.
+    # Clipped before squaring: an infinite clearance must not make the gradient NaN.
     shortfall = jnp.clip(margin - clearance, 0, margin)
     return shortfall**2 / (2 * margin) + jnp.maximum(-clearance, 0)

@@ -1,4 +1,4 @@
-"""Trajectory optimisation: an elastic band that the map's gradients push off its surfaces."""
+"""Trajectory optimization: an elastic band that the map's gradients push off surfaces."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import optax
 
 from hiosdf_jax._src.field.points import AnyField, Unknown, sdf_and_grad
 from hiosdf_jax._src.numerics.gradient import least
+from hiosdf_jax._src.numerics.vectors import length, split
 
-# Points at which each segment is held off the map; the last one is its end.
+# Samples per segment that are held off the map; the last one is the segment's end.
 _SAMPLES_PER_SEGMENT = 4
 
-# Weight of the squared intrusion, 1/m^2, against the band's energy relative to the straight line's.
+# Weight of the squared intrusion, 1/m^2. The band's energy is relative to the straight line's.
 _INTRUSION_WEIGHT = 2000.0
 
 
@@ -24,8 +25,8 @@ class Trajectory(NamedTuple):
 
     Attributes:
         waypoints_world: (..., N, 3) m.
-        clearance: Least distance to the map along the path, less the radius, (...) m.
-        length: (...) m.
+        clearance: Least clearance of the ball along the path, (...) m.
+        length: Length of the path, (...) m.
     """
 
     waypoints_world: jax.Array
@@ -36,18 +37,18 @@ class Trajectory(NamedTuple):
 def waves(
     key: jax.Array, start_world: Any, goal_world: Any, count: int, waypoints: int, spread_m: float
 ) -> jax.Array:
-    """Draws first guesses: straight lines with one, two and three half waves laid over them.
+    """Draws initial guesses: straight lines with one, two and three half waves added.
 
-    An optimiser that follows gradients keeps to the side of an obstacle that it begins on: draw
-    many, optimise them all, and take the shortest that is clear.
+    A gradient-based optimizer keeps to the side of an obstacle that it starts on. Draw many
+    guesses, optimize them all, and take the shortest one that is clear.
 
     Args:
         key: Source of the randomness.
         start_world: (3,) m.
         goal_world: (3,) m.
-        count: How many; the first one is the straight line.
-        waypoints: Points of each, ends included.
-        spread_m: Standard deviation of the height of each wave, along each axis.
+        count: Number of guesses; the first is the straight line.
+        waypoints: Points per guess, ends included.
+        spread_m: Standard deviation of each wave's height along each axis.
 
     Returns:
         (count, waypoints, 3) m.
@@ -72,33 +73,44 @@ def optimize_trajectory(
     """Shortens paths and pushes them off the map, by Adam on the map's distances and gradients.
 
     The cost is that of CHOMP (Ratliff et al., ICRA 2009) in its simplest form: the energy of the
-    band, (N - 1) sum |x_{i+1} - x_i|^2 relative to the straight line's, and the mean square of how
-    far samples along it intrude into radius + margin.
+    band, (N - 1) sum |x_{i+1} - x_i|^2 relative to the straight line's, plus the mean squared
+    intrusion of samples along it into radius + margin.
+
+    Example:
+        start_world, goal_world = jnp.array([0.0, 0.0, 0.5]), jnp.array([2.0, 1.0, 0.5])
+        guesses = planning.waves(
+            jax.random.key(0), start_world, goal_world, count=16, waypoints=32, spread_m=0.3
+        )
+        paths = planning.optimize_trajectory(field, guesses, radius_m=0.15)
+        best = jnp.argmin(jnp.where(paths.clearance > 0, paths.length, jnp.inf))
+        waypoints_world = paths.waypoints_world[best]
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
         initial_world: (..., N, 3) m, N >= 3; the ends stay where they are.
         radius_m: Radius of the ball that follows the path.
-        margin_m: Clearance that is wanted beyond it; it is soft.
+        margin_m: Clearance to aim for; a soft constraint.
         steps: Steps of Adam.
-        step_m: Its learning rate: the most that a waypoint moves in a step, about. It decays.
-        unknown: What to make of space that no ray has reached, as for `sdf`.
+        step_m: Adam's learning rate, about the most that a waypoint moves per step. It decays.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
-        The paths, each from its own first guess.
+        The optimized paths, one per guess.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: `initial_world` has a wrong shape, or the radius or the margin is negative or
+            not finite.
     """
     initial = jnp.asarray(initial_world, jnp.float32)
     if initial.ndim < 2 or initial.shape[-1] != 3 or initial.shape[-2] < 3:
         raise ValueError(f"initial_world has shape {initial.shape}, expected (..., N >= 3, 3)")
     for name, value in (("radius_m", radius_m), ("margin_m", margin_m)):
         if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} is {value!r}, expected >= 0")
+            raise ValueError(f"{name} is {value!r}, expected >= 0 and finite")
     wanted = radius_m + margin_m
     segments = initial.shape[-2] - 1
-    straight = jnp.maximum(_length(initial[..., -1, :] - initial[..., 0, :]), 1e-3)
+    straight = jnp.maximum(length(split(initial[..., -1, :] - initial[..., 0, :])), 1e-3)
     inner = jnp.ones((segments + 1, 1)).at[jnp.array([0, -1])].set(0)
 
     def gradient(path: jax.Array) -> jax.Array:
@@ -106,10 +118,10 @@ def optimize_trajectory(
         distance, normal = sdf_and_grad(field, samples_world, unknown)
 
         def cost(path: jax.Array) -> jax.Array:
-            # The map to first order: exact for the gradient, and asked only once.
+            # The map to first order: exact for the gradient, with one query.
             moved = _along(path) - samples_world
             intrusion = jax.nn.relu(wanted - distance - jnp.sum(normal * moved, axis=-1))
-            spacing = _length(jnp.diff(path, axis=-2))
+            spacing = length(split(jnp.diff(path, axis=-2)))
             stretch = segments * jnp.sum(spacing**2, axis=-1) / straight**2
             per_segment = jnp.reshape(intrusion[..., 1:] ** 2, (*spacing.shape, -1)).mean(-1)
             return jnp.sum(
@@ -127,16 +139,11 @@ def optimize_trajectory(
 
     (path, _), _ = jax.lax.scan(step, (initial, adam.init(initial)), length=steps)
     clearance = least(sdf_and_grad(field, _along(path), unknown)[0]) - radius_m
-    return Trajectory(path, clearance, jnp.sum(_length(jnp.diff(path, axis=-2)), axis=-1))
-
-
-def _length(vectors: jax.Array) -> jax.Array:
-    # The root has no derivative at 0, where two waypoints coincide.
-    return jnp.sqrt(jnp.sum(vectors**2, axis=-1) + 1e-12)
+    return Trajectory(path, clearance, jnp.sum(length(split(jnp.diff(path, axis=-2))), axis=-1))
 
 
 def _along(path: jax.Array) -> jax.Array:
-    """Samples evenly spaced along each segment, (..., N, 3) -> (..., 1 + (N - 1) k, 3)."""
+    """Samples each segment evenly, (..., N, 3) -> (..., 1 + (N - 1) k, 3)."""
     share = (jnp.arange(_SAMPLES_PER_SEGMENT) + 1)[:, None] / _SAMPLES_PER_SEGMENT
     begin, end = path[..., :-1, None, :], path[..., 1:, None, :]
     inner = begin + share * (end - begin)

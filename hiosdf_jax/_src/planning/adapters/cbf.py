@@ -1,4 +1,4 @@
-"""The map as barrier of a `cbfpy` control barrier function: a filter for velocity commands."""
+"""A safety filter for velocity commands: the map as a control barrier function of `cbfpy`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import numpy as np
 from hiosdf_jax._src.field.points import AnyField, Unknown, sdf
 from hiosdf_jax._src.state import Baked
 
-Spheres = Callable[[jax.Array], tuple[jax.Array, Any]]
-"""Configuration (n,) -> the body as centers_world (S, 3) m and radii (S,) m."""
+BodySpheres = Callable[[jax.Array], tuple[jax.Array, Any]]
+"""Configuration (n,) -> the body's spheres: centers_world (S, 3) m and radii (S,) m."""
 
 _PENALTY = 100.0
 _TOLERANCE = 1e-3
 
 
 def velocity_filter(
-    spheres: Spheres,
+    spheres: BodySpheres,
     velocity_limits: Any,
     *,
     margin_m: float,
@@ -31,42 +31,50 @@ def velocity_filter(
 ) -> Callable[[AnyField, jax.Array, jax.Array], jax.Array]:
     """Makes a filter that changes velocity commands as little as keeps the body off the map.
 
-    With h_i = sdf(center_i) - radius_i - margin for every sphere i of the body, it answers the
-    velocity nearest to the desired one, in units of the limits, among those within the limits for
-    which d(h_i)/dt >= -gain h_i. Where there is none it violates them as little as it can, and
-    where the solver fails it stops. The answer is good to 3 % of the limits (float32).
+    With h_i = sdf(center_i) - radius_i - margin for every sphere i of the body, the filter returns
+    the velocity nearest to the desired one, in units of the limits, among those within the limits
+    for which d(h_i)/dt >= -gain h_i. Where none exists it violates the constraints as little as it
+    can, and where the solver fails it stops. The result is accurate to 3 % of the limits (float32).
 
-    A sphere sees the surface nearest to its center alone, so that in a corner the filter would obey
-    one wall at a time: describe a thick body by several spheres, as `inscribed` does.
+    A sphere sees only the surface nearest to its center, so that in a corner the filter would obey
+    one wall at a time. Describe a thick body by several spheres, see `inscribed`.
+
+    Example:
+        def body(position):
+            return planning.cbf.inscribed(position[None], jnp.array([0.15]))
+
+        safe = jax.jit(planning.cbf.velocity_filter(body, [1.0, 1.0, 1.0], margin_m=0.1))
+        velocity = safe(field, jnp.array([0.5, 0.0, 0.3]), jnp.array([-1.0, 0.0, 0.0]))
 
     Args:
         spheres: The body at a configuration, a pure function of JAX arrays.
         velocity_limits: (n,) > 0, the largest |velocity| of each coordinate, m/s or rad/s.
-        margin_m: Clearance to keep. Commands are held for a time dt: what a sphere travels in dt
-            belongs into the margin, and so does the map's error.
-        gain_per_s: The clearance beyond the margin shrinks by at most this share a second; keep it
-            well below 1 / dt.
-        unknown: What to make of space that no ray has reached, as for `sdf`.
+        margin_m: Clearance to keep, m, >= 0. It has to cover the distance that a sphere travels
+            while a command is held, and the map's error.
+        gain_per_s: The clearance beyond the margin shrinks by at most this fraction per second.
+            Keep it well below 1 / dt for commands held for dt.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
         The pure function (field, q (n,), desired velocity (n,)) -> velocity (n,). The map is a
-        traced argument; vmap it over q for many robots.
+        traced argument. Use vmap over q for many robots.
 
     Raises:
-        ValueError: A number is not what it should be.
+        ValueError: A limit or the gain is not positive, or the margin is negative.
     """
     limits = np.asarray(velocity_limits, float)
     if limits.ndim != 1 or not (np.isfinite(limits).all() and (limits > 0).all()):
-        raise ValueError(f"velocity_limits is {velocity_limits!r}, expected (n,) numbers > 0")
+        raise ValueError(f"velocity_limits is {velocity_limits!r}, expected shape (n,), all > 0")
     if not (math.isfinite(margin_m) and margin_m >= 0):
-        raise ValueError(f"margin_m is {margin_m!r}, expected >= 0")
+        raise ValueError(f"margin_m is {margin_m!r}, expected >= 0 and finite")
     if not (math.isfinite(gain_per_s) and gain_per_s > 0):
-        raise ValueError(f"gain_per_s is {gain_per_s!r}, expected > 0")
+        raise ValueError(f"gain_per_s is {gain_per_s!r}, expected > 0 and finite")
     cbf = cbfpy.CBF.from_config(_Shares(spheres, limits, margin_m, gain_per_s, unknown))
 
     def filtered(field: AnyField, q: jax.Array, desired: jax.Array) -> jax.Array:
         shares = cbf.safety_filter(q, desired / limits, field)
-        # A robot that obeys velocities is safe where it stands.
+        # A robot that tracks velocities is safe where it stands.
         shares = jnp.where(jnp.isfinite(shares).all(), jnp.clip(shares, -1, 1), 0)
         return shares * limits
 
@@ -74,20 +82,20 @@ def velocity_filter(
 
 
 def inscribed(centers: Any, radii: Any, share: float = 0.5) -> tuple[jax.Array, jax.Array]:
-    """Adds to each sphere six smaller ones that touch it from inside, along +-x, +-y and +-z.
+    """Adds six smaller spheres to each sphere, touching it from inside along +-x, +-y and +-z.
 
-    They add nothing to the body, but each sees the surface on its own side.
+    They do not enlarge the body, but each sees the surface on its own side.
 
     Args:
         centers: (S, 3) m.
         radii: (S,) m.
-        share: Radius of the smaller ones, as a share of the sphere's, in (0, 1).
+        share: Radius of the smaller spheres as a fraction of the sphere's, in (0, 1).
 
     Returns:
-        centers (7 S, 3) m and radii (7 S,) m; the given ones come first.
+        centers (7 S, 3) m and radii (7 S,) m; the given spheres come first.
 
     Raises:
-        ValueError: share is out of range.
+        ValueError: `share` is out of range.
     """
     if not 0 < share < 1:
         raise ValueError(f"share is {share!r}, expected 0 < share < 1")
@@ -106,7 +114,7 @@ class _Shares(cbfpy.CBFConfig):
 
     def __init__(
         self,
-        spheres: Spheres,
+        spheres: BodySpheres,
         limits: np.ndarray,
         margin_m: float,
         gain_per_s: float,
@@ -115,7 +123,7 @@ class _Shares(cbfpy.CBFConfig):
         self._limits, self._gain_per_s = limits, gain_per_s
         count = len(limits)
 
-        # cbfpy's checks call it eagerly several times, which takes seconds without jit.
+        # Compiled: cbfpy's checks call this several times outside jit, which would take seconds.
         @jax.jit
         def barriers(z: jax.Array, field: AnyField) -> jax.Array:
             centers_world, radii = spheres(z)
@@ -127,12 +135,12 @@ class _Shares(cbfpy.CBFConfig):
             count,
             u_min=-np.ones(count),
             u_max=np.ones(count),
-            # cbfpy's own penalties and tolerances are too far apart for float32, and give NaN.
+            # cbfpy's default penalties and tolerances are too far apart for float32 and give NaN.
             cbf_relaxation_penalty=_PENALTY,
             control_relaxation_penalty=_PENALTY,
             solver_tol=_TOLERANCE,
-            # cbfpy keeps the arguments of its checks for good: the least map that will do.
-            init_args=(_smallest(),),
+            # cbfpy keeps the arguments of its checks, hence the smallest map that passes them.
+            init_args=(_smallest_map(),),
         )
 
     def f(self, z: jax.Array, field: AnyField) -> jax.Array:
@@ -148,8 +156,8 @@ class _Shares(cbfpy.CBFConfig):
         return self._gain_per_s * h
 
 
-def _smallest() -> Baked:
-    """A slope along (1, 1, 1), so that cbfpy's check finds that the control matters."""
+def _smallest_map() -> Baked:
+    """A slope along (1, 1, 1): cbfpy checks that the control changes the barrier."""
     slope = jnp.indices((2, 2, 2)).sum(0).astype(jnp.float32)
     return Baked(
         corner_world=jnp.zeros(3),

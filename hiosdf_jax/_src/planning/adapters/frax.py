@@ -1,4 +1,4 @@
-"""Whole-arm clearance of a manipulator of `frax`, whose links carry collision spheres."""
+"""Whole-arm clearance of a `frax` manipulator, whose links carry collision spheres."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def arm_spheres(
 ) -> tuple[jax.Array, jax.Array]:
     """Places the collision spheres of an arm's moving links.
 
-    Those of its base are left out: they cannot move, and would always touch what it stands on.
+    Spheres of the base are left out: they cannot move, and would always touch what it stands on.
 
     Args:
-        arm: A robot of frax with collision data, such as `frax.load_panda()`; static under jit.
+        arm: A frax robot with collision data, such as `frax.load_panda()`; static under jit.
         q: (..., n) joint positions, rad or m.
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
 
@@ -31,11 +31,11 @@ def arm_spheres(
         centers_world (..., S, 3) m and radii (S,) m.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: The arm has no collision data, or a shape is wrong.
     """
     q = jnp.asarray(q, jnp.float32)
     if not arm.has_collision_data:
-        raise ValueError("arm has no collision data, expected the spheres of its links")
+        raise ValueError("arm has no collision data, expected spheres on its links")
     if q.ndim == 0 or q.shape[-1] != arm.nq:
         raise ValueError(f"q has shape {q.shape}, expected (..., {arm.nq})")
     pose = jnp.eye(4) if pose_world_base is None else jnp.asarray(pose_world_base)
@@ -52,22 +52,28 @@ def arm_clearance(
     arm: Manipulator,
     q: Any,
     pose_world_base: Any = None,
-    unknown: Unknown = "network",
+    unknown: Unknown = "obstacle",
 ) -> jax.Array:
-    """Distance between the map and the nearest of an arm's moving links.
+    """Computes the clearance of the nearest of an arm's moving links.
+
+    Example:
+        arm = frax.load_panda()
+        arm_clearance = jax.jit(planning.frax.arm_clearance, static_argnames=("arm", "unknown"))
+        clearance = arm_clearance(field, arm, jnp.zeros((10, 7)))
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
         arm: As for `arm_spheres`.
         q: (..., n) joint positions, rad or m.
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
-        unknown: What to make of space that no ray has reached, as for `sdf`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
-        (...) float32, m: the least of sdf(center) - radius; negative in collision. Differentiable.
+        (...) float32, m: the least sdf(center) - radius, negative in collision. Differentiable.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: As for `arm_spheres`.
     """
     centers_world, radii = arm_spheres(arm, q, pose_world_base)
     return least(sphere_clearance(field, centers_world, radii, unknown))
@@ -78,22 +84,23 @@ def arm_clearance_and_grad(
     arm: Manipulator,
     q: Any,
     pose_world_base: Any = None,
-    unknown: Unknown = "network",
+    unknown: Unknown = "obstacle",
 ) -> tuple[jax.Array, jax.Array]:
-    """The same and its gradient by the joints, by one backward pass for the whole batch.
+    """Computes `arm_clearance` and its gradient, by one backward pass for the batch.
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
         arm: As for `arm_spheres`.
         q: (..., n) joint positions, rad or m.
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
-        unknown: What to make of space that no ray has reached, as for `sdf`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
-        The clearance (...) float32, m, and d(clearance)/dq (..., n) float32, m/rad or 1.
+        The clearance (...) float32, m, and d(clearance)/dq (..., n) float32, m/rad or m/m.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: As for `arm_spheres`.
     """
     q = jnp.asarray(q, jnp.float32)
     return value_and_gradient(lambda q: arm_clearance(field, arm, q, pose_world_base, unknown), q)

@@ -1,4 +1,4 @@
-"""Rollouts of a robot in MJX: where its spheres go, so that a cost asks the map once for all."""
+"""Rollouts of a robot in MJX, with the centers of its spheres: a cost queries the map once."""
 
 # mujoco's bindings carry no types that pyright can see.
 # pyright: reportAttributeAccessIssue=false
@@ -18,8 +18,8 @@ class Rollout(NamedTuple):
     """States after each control.
 
     Attributes:
-        qpos: Generalized positions, (..., H, nq).
-        qvel: Generalized velocities, (..., H, nv).
+        qpos: Generalized positions, (..., H, nq), m or rad.
+        qvel: Generalized velocities, (..., H, nv), per second.
         centers_world: Centers of the chosen geoms, (..., H, S, 3) m.
     """
 
@@ -35,15 +35,15 @@ def sphere_geoms(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
         model: The robot.
 
     Returns:
-        Their indices (S,) int and radii (S,) float32, m.
+        Indices (S,) int and radii (S,) float32, m.
 
     Raises:
-        ValueError: There is none.
+        ValueError: The model has none.
     """
     spheres = model.geom_type == int(mujoco.mjtGeom.mjGEOM_SPHERE)
     geoms = np.flatnonzero(spheres & (model.body_weldid[model.geom_bodyid] != 0))
     if geoms.size == 0:
-        raise ValueError(f"model has {model.ngeom} geoms, expected spheres on a body that moves")
+        raise ValueError(f"model has {model.ngeom} geoms, expected spheres on a moving body")
     return geoms, model.geom_size[geoms, 0].astype(np.float32)
 
 
@@ -54,20 +54,20 @@ def rollout(
     geoms: np.ndarray,
     steps_per_control: int = 1,
 ) -> Rollout:
-    """Simulates control sequences from one state, all of them in parallel.
+    """Simulates control sequences from one state, in parallel.
 
     Args:
         model: The robot, `mjx.put_model(model)`.
-        data: The state that all begin with.
-        controls: (..., H, nu), each held for `steps_per_control` steps of the simulation.
-        geoms: (S,) indices of the geoms whose centers are wanted, see `sphere_geoms`.
+        data: The initial state.
+        controls: (..., H, nu), each held for `steps_per_control` simulation steps.
+        geoms: (S,) indices of the geoms to place, see `sphere_geoms`.
         steps_per_control: >= 1.
 
     Returns:
         The states after each control.
 
     Raises:
-        ValueError: An argument is not what it should be.
+        ValueError: `controls` has a wrong shape, or `steps_per_control` < 1.
     """
     if controls.ndim < 2 or controls.shape[-1] != model.nu:
         raise ValueError(f"controls has shape {controls.shape}, expected (..., H, {model.nu})")
@@ -77,7 +77,7 @@ def rollout(
     def hold(state: mjx.Data, control: jax.Array) -> tuple[mjx.Data, Rollout]:
         state = state.replace(ctrl=control)
         state = jax.lax.fori_loop(0, steps_per_control, lambda _, s: mjx.step(model, s), state)
-        # A step leaves the geoms where they were before it.
+        # A step does not update the geoms.
         placed = mjx.kinematics(model, state)
         return state, Rollout(state.qpos, state.qvel, placed.geom_xpos[jnp.asarray(geoms)])
 

@@ -1,9 +1,9 @@
-"""Few spheres that cover a solid entirely and protrude beyond it by at most a tolerance.
+"""Covers of solids by few spheres that protrude by at most a tolerance.
 
-A ball around c of radius tolerance - sdf(c) is the largest that protrudes no farther: nothing in it
-is farther from the solid than the tolerance. Capsules and boxes have covers in closed form; for
-other solids such balls are chosen greedily until each cell of a partition of the solid lies in one
-of them, so that the cover is complete by construction and not up to a sampling.
+The largest ball around c that protrudes no farther has radius tolerance - sdf(c). Capsules and
+boxes have covers in closed form. For other solids such balls are chosen greedily until each cell of
+a partition of the solid lies in one of them: the cover is complete by construction, not up to a
+sampling.
 """
 
 from __future__ import annotations
@@ -14,17 +14,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Lower and upper bounds of the signed distance, m, to (N, 3) points.
 SignedDistance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-Spheres = tuple[np.ndarray, np.ndarray]
+"""(N, 3) m -> lower and upper bounds of the signed distance, (N,) m each."""
 
-# Half diagonals of the smallest cells of the partition and of the grid of centers, shares of the
-# tolerance: finer cells need fewer spheres and more time.
+SphereCover = tuple[np.ndarray, np.ndarray]
+"""Centers (S, 3) and radii (S,), m, float64."""
+
+# Half diagonals of the smallest cells of the partition and of the grid of centers, relative to the
+# tolerance. Finer cells need fewer spheres and more time.
 _CELL = 1 / 8
 _CENTER = 1 / 2
-# Cells may be larger deep inside, where the balls are large: half diagonal over depth.
+# Half diagonal over depth: deep inside, where the balls are large, cells may be larger too.
 _CELL_BY_DEPTH = 1 / 4
-# Cells and centers that the greedy choice looks at at once; it goes on until all are done.
+# Most cells and centers per round of the greedy choice; rounds repeat until all are covered.
 _MOST_CELLS = 12_000
 _MOST_CENTERS = 4_000
 _MOST_OWN = 500
@@ -33,7 +35,7 @@ _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 class _Ball(NamedTuple):
-    """A ball, the cells in it, and the radius that contains each of them."""
+    """A ball, the cells in it, and the radius that it needs to contain each."""
 
     center: np.ndarray
     radius: float
@@ -41,19 +43,19 @@ class _Ball(NamedTuple):
     needed: np.ndarray
 
 
-def cover_capsule(radius: float, half_length: float, tolerance: float) -> Spheres:
+def cover_capsule(radius: float, half_length: float, tolerance: float) -> SphereCover:
     """Covers a capsule by equal spheres in a row.
 
     Args:
         radius: m.
-        half_length: Of its axis, along z, m; 0 makes a sphere.
+        half_length: Half the length of its axis, along z, m; 0 makes a sphere.
         tolerance: m, > 0.
 
     Returns:
-        Centers (S, 3) and radii (S,), m, float64.
+        The spheres.
     """
-    # With gaps of 2 g and the outer centers e from the ends of the axis, a sphere must reach
-    # radius + e at the ends and hypot(radius, g) between; m gaps make both the same if
+    # With gaps of 2 g and the outer centers e from the ends of the axis, a sphere needs radius + e
+    # at the ends and hypot(radius, g) between. With m gaps both are equal if
     # (m^2 - 1) e^2 + 2 (m^2 radius + half_length) e - half_length^2 = 0.
     gaps = 0
     inset = half_length
@@ -67,17 +69,17 @@ def cover_capsule(radius: float, half_length: float, tolerance: float) -> Sphere
     return centers, np.full(gaps + 1, radius + inset)
 
 
-def cover_box(half: np.ndarray, tolerance: float) -> Spheres:
-    """Covers a box by the spheres around the cells of a lattice, larger ones inside.
+def cover_box(half: np.ndarray, tolerance: float) -> SphereCover:
+    """Covers a box by spheres around the cells of a lattice, with larger ones inside.
 
     Args:
-        half: (3,) half of its edges, m.
+        half: (3,) half the lengths of its edges, m.
         tolerance: m, > 0.
 
     Returns:
-        Centers (S, 3) and radii (S,), m, float64.
+        The spheres.
     """
-    # The lattices that are worth trying, coarse to fine: edges that divide one of the box's.
+    # Candidate lattices, coarse to fine, whose edges divide one of the box's.
     finest = tolerance / 2
     sizes = np.unique(np.concatenate([h / np.arange(1, np.ceil(h / finest) + 2) for h in half]))
     for size in sizes[::-1]:
@@ -95,33 +97,33 @@ def cover_box(half: np.ndarray, tolerance: float) -> Spheres:
     centers, radii = (2 * index + 1 - counts) * cell, np.full(len(index), radius)
     if not hollow:
         return centers, radii
-    # The cells inside are a box of their own, whose spheres may fill the layer around it too.
+    # The inner cells form a box of their own. Its spheres may also fill the layer around it.
     inner_centers, inner_radii = cover_box(half - 2 * cell, tolerance + 2 * cell.min())
     return np.concatenate([centers, inner_centers]), np.concatenate([radii, inner_radii])
 
 
 def cover_solid(
     distance: SignedDistance, low: np.ndarray, high: np.ndarray, tolerance: float
-) -> Spheres:
-    """Covers any solid whose signed distance is known.
+) -> SphereCover:
+    """Covers a solid given by its signed distance.
 
     Args:
-        distance: Bounds of its signed distance.
-        low: (3,) least corner of a box that contains it, m.
-        high: (3,) greatest corner.
+        distance: Bounds of the signed distance.
+        low: (3,) m, low corner of a box that contains the solid.
+        high: (3,) m, high corner.
         tolerance: m, > 0.
 
     Returns:
-        Centers (S, 3) and radii (S,), m, float64.
+        The spheres.
     """
-    # Imported here: what needs no cover of this kind does without.
+    # Imported here: other covers do not need it.
     from scipy.spatial import KDTree
 
     random = np.random.default_rng(0)
     cells, reach = _partition(distance, low, high, _CELL * tolerance)
     tree = KDTree(cells)
     centers, size = _partition(distance, low, high, _CENTER * tolerance)
-    # With their corners, so that planes of symmetry have centers on them.
+    # With the cells' corners, so that planes of symmetry carry centers.
     corners = (centers[:, None] + _CORNERS * size[:, None, None] / np.sqrt(3)).reshape(-1, 3)
     centers = np.unique(np.concatenate([centers, corners]).round(9), axis=0)
     radii = tolerance - distance(centers)[1]
@@ -131,7 +133,7 @@ def cover_solid(
     while uncovered.any():
         some = _draw(random, np.nonzero(uncovered)[0], _MOST_CELLS)
         rows = _draw(random, np.arange(len(centers)), _MOST_CENTERS)
-        # Around a cell itself there is always a ball that contains it.
+        # The ball around a cell's own center always contains the cell.
         own = cells[_draw(random, some, _MOST_OWN)]
         tried = np.concatenate([centers[rows], own])
         largest = np.concatenate([radii[rows], tolerance - distance(own)[1]])
@@ -169,14 +171,14 @@ def _partition(
 
 
 def _draw(random: np.random.Generator, index: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the indices, in their order."""
+    """Draws at most `most` of the indices and keeps their order."""
     return index if len(index) <= most else np.sort(random.choice(index, most, replace=False))
 
 
 def _choose(
     centers: np.ndarray, radii: np.ndarray, cells: np.ndarray, reach: np.ndarray
 ) -> list[int]:
-    """Chooses balls greedily, those of the cells that only small balls contain first."""
+    """Chooses balls greedily, starting at cells that only small balls contain."""
     from scipy.spatial.distance import cdist
 
     contains = np.empty((len(centers), len(cells)), bool)
@@ -197,8 +199,8 @@ def _choose(
     return picked
 
 
-def _tighten(balls: list[_Ball], cells: int) -> Spheres:
-    """Leaves out balls that the others make needless, and shrinks those that stay."""
+def _tighten(balls: list[_Ball], cells: int) -> SphereCover:
+    """Drops redundant balls and shrinks the others."""
     times = np.zeros(cells, int)
     for ball in balls:
         times[ball.cells] += 1
@@ -208,7 +210,7 @@ def _tighten(balls: list[_Ball], cells: int) -> Spheres:
             times[ball.cells] -= 1
         else:
             kept.append(ball)
-    # Each cell goes to the ball that has most room for it.
+    # Each cell belongs to the ball with most room for it.
     room, needed = np.full(cells, -np.inf), np.zeros(cells)
     owner = np.zeros(cells, int)
     for k, ball in enumerate(kept):

@@ -1,4 +1,4 @@
-"""A robot's geoms as spheres on its bodies, and where they are in a configuration."""
+"""A MuJoCo robot as spheres on its bodies, and their clearance in a configuration."""
 
 # mujoco's bindings carry no types that pyright can see.
 # pyright: reportAttributeAccessIssue=false
@@ -25,8 +25,8 @@ class RobotSpheres(flax.struct.PyTreeNode):
     """Spheres on the bodies of a robot; made by `spheres_from_model`.
 
     Attributes:
-        body: The body that carries the sphere, (S,) int32.
-        centers_body: In that body's frame, (S, 3) float32, m.
+        body: Index of the body that carries each sphere, (S,) int32.
+        centers_body: Centers in that body's frame, (S, 3) float32, m.
         radii: (S,) float32, m.
     """
 
@@ -36,11 +36,11 @@ class RobotSpheres(flax.struct.PyTreeNode):
 
 
 class BodyPoses(NamedTuple):
-    """Where bodies are; `mjx.Data` and `mujoco.MjData` have the same two attributes.
+    """Poses of bodies; `mjx.Data` and `mujoco.MjData` have the same two attributes.
 
     Attributes:
-        xpos: Positions of the bodies' frames, (..., B, 3) m, world frame.
-        xmat: Rotations T_world_body, (..., B, 3, 3) or (..., B, 9), row by row.
+        xpos: Origins of the bodies' frames, (..., B, 3) m, world.
+        xmat: Rotations T_world_body, (..., B, 3, 3) or row-major (..., B, 9).
     """
 
     xpos: Any
@@ -53,24 +53,29 @@ def spheres_from_model(
     bodies: Iterable[int | str] | None = None,
     geoms: Iterable[int | str] | None = None,
 ) -> RobotSpheres:
-    """Covers geoms entirely by spheres that protrude at most a tolerance beyond them.
+    """Covers geoms of a robot by spheres that protrude by at most a tolerance.
 
-    Meshes are covered as they are, with all that they enclose, not as the convex hulls that MuJoCo
-    collides. Half the tolerance means about four times the spheres. Not inside jit.
+    The cover is complete. A mesh is covered as it is, with all that it encloses, not as the convex
+    hull that MuJoCo collides. Half the tolerance takes about four times as many spheres. Not inside
+    jit.
+
+    Example:
+        model = mujoco.MjModel.from_xml_path("examples/rover.xml")
+        spheres = planning.spheres_from_model(model, tolerance_m=0.02)
 
     Args:
         model: `mujoco.MjModel` or `mjx.Model`.
-        tolerance_m: How far a sphere may protrude beyond its geom, m, > 0.
+        tolerance_m: Most that a sphere may protrude beyond its geom, m, > 0.
         bodies: Names or ids of the bodies whose colliding geoms (contype or conaffinity not 0)
-            are covered; without them all but the world's.
+            are covered; by default all bodies but the world.
         geoms: Names or ids of the geoms to cover, instead of `bodies`.
 
     Returns:
         The spheres, in the order of the geoms.
 
     Raises:
-        ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen,
-            or one of them is a plane, a height field or an SDF; the message names it.
+        ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen, or
+            a chosen geom is a plane, a height field or an SDF.
     """
     if isinstance(tolerance_m, bool) or not (math.isfinite(tolerance_m) and tolerance_m > 0):
         raise ValueError(f"tolerance_m is {tolerance_m}, expected > 0 and finite")
@@ -90,18 +95,18 @@ def spheres_from_model(
 
 
 def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
-    """Centers of a robot's spheres in a configuration.
+    """Places a robot's spheres in a configuration.
 
     Args:
         spheres: The robot's spheres.
-        data: What has the bodies' poses as `xpos` and `xmat`: `mjx.Data` after `mjx.kinematics`
-            (or a step), `mujoco.MjData`, or `BodyPoses`.
+        data: The bodies' poses as `xpos` and `xmat`: `mjx.Data` after `mjx.kinematics` or a step,
+            `mujoco.MjData`, or `BodyPoses`.
 
     Returns:
-        (..., S, 3) float32, m, world frame. Differentiable.
+        Centers, (..., S, 3) float32, m, world. Differentiable.
 
     Raises:
-        ValueError: The poses' shapes are wrong, or there are fewer bodies than the spheres name.
+        ValueError: A shape of the poses is wrong, or there are fewer bodies than the spheres need.
     """
     xpos, xmat = jnp.asarray(data.xpos, jnp.float32), jnp.asarray(data.xmat, jnp.float32)
     if xpos.ndim < 2 or xpos.shape[-1] != 3:
@@ -116,27 +121,36 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
         if largest >= xpos.shape[-2]:
             raise ValueError(
                 f"data has {xpos.shape[-2]} bodies, expected more than {largest}, the largest "
-                f"of spheres.body"
+                f"index in spheres.body"
             )
     rotations = xmat.reshape(*xpos.shape, 3)[..., spheres.body, :, :]
-    # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
+    # Sums of products: a matrix product may run in reduced precision on a GPU.
     offsets_world = jnp.sum(rotations * spheres.centers_body[:, None, :], axis=-1)
     return xpos[..., spheres.body, :] + offsets_world
 
 
 def robot_clearance(
-    field: AnyField, spheres: RobotSpheres, data: Any, unknown: Unknown = "network"
+    field: AnyField, spheres: RobotSpheres, data: Any, unknown: Unknown = "obstacle"
 ) -> jax.Array:
-    """Least clearance of a robot's spheres in a configuration.
+    """Computes the least clearance of a robot's spheres in a configuration.
+
+    Example:
+        model = mujoco.MjModel.from_xml_path("examples/rover.xml")
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        spheres = planning.spheres_from_model(model, tolerance_m=0.02)
+        clearance = planning.robot_clearance(field, spheres, data)
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
         spheres: The robot's spheres.
         data: As for `place_spheres`.
-        unknown: As for `hiosdf_jax.sdf`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
 
     Returns:
-        (...) float32, m. Differentiable, by the joints through `mjx.kinematics`.
+        (...) float32, m; negative in collision. Differentiable, through `mjx.kinematics` also by
+        the joint positions.
 
     Raises:
         ValueError: As for `place_spheres` and `sphere_clearance`.
@@ -147,7 +161,7 @@ def robot_clearance(
 
 def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
     if bodies is not None and geoms is not None:
-        raise ValueError("bodies and geoms are both given, expected one of them")
+        raise ValueError("bodies and geoms are both given, expected at most one of them")
     if geoms is not None:
         chosen = _ids(model, geoms, "geom", model.ngeom)
     else:
@@ -160,13 +174,13 @@ def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
         carried = np.isin(np.asarray(model.geom_bodyid), list(carriers))
         chosen = np.nonzero(colliding & carried)[0].tolist()
     if not chosen:
-        raise ValueError("no geom is chosen, expected bodies with colliding geoms, or geoms")
+        raise ValueError("no geom is chosen, expected geoms, or bodies with colliding geoms")
     return sorted(set(chosen))
 
 
 def _ids(model: Any, wanted: Any, kind: str, count: int) -> list[int]:
     if isinstance(wanted, str):
-        raise ValueError(f"{kind} names are the string {wanted!r}, expected several in a list")
+        raise ValueError(f"{kind} names are the string {wanted!r}, expected a list of names")
     names = [_name(model, kind, k) for k in range(count)]
     ids = []
     for item in wanted:
@@ -186,8 +200,8 @@ def _name(model: Any, kind: str, index: int) -> str:
     return model.names[start : model.names.index(b"\0", start)].decode()
 
 
-def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.Spheres:
-    # Imported here: the rest of the package does without.
+def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.SphereCover:
+    # Imported here: nothing else in this module needs it.
     import mujoco
 
     size = np.asarray(model.geom_size[geom], float)
@@ -215,7 +229,7 @@ def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.Spheres:
 
 
 def _mesh(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) m, in the geom's frame, and faces (F, 3) of a mesh."""
+    """Vertices (V, 3) m, geom frame, and faces (F, 3) of a mesh."""
 
     def rows(array: Any, starts: Any) -> np.ndarray:
         last = starts[mesh + 1] if mesh + 1 < len(starts) else len(array)
@@ -226,7 +240,7 @@ def _mesh(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """The rotation matrix of (w, x, y, z)."""
+    """Rotation matrix of a quaternion (w, x, y, z)."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(
         [
