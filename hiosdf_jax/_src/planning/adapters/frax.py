@@ -58,7 +58,8 @@ def arm_clearance(
 
     Example:
         arm = frax.load_panda()
-        clearance = planning.frax.arm_clearance(field, arm, jnp.zeros(7))
+        arm_clearance = jax.jit(planning.frax.arm_clearance, static_argnames=("arm", "unknown"))
+        clearance = arm_clearance(field, arm, jnp.zeros((10, 7)))
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.
