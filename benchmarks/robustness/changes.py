@@ -1,0 +1,84 @@
+"""Scenarios of things that appear, jump or cross between scans."""
+
+from __future__ import annotations
+
+from benchmarks.robustness import library, measures
+from benchmarks.robustness.library import Frame, Setup
+from benchmarks.robustness.scenes import BOUNDS, MAX_RANGE, ROOM, facing_path
+from benchmarks.robustness.sensors import Scan, Sensor, depth_camera, lidar, scan
+from benchmarks.robustness.worlds import Box, World
+
+Rows = dict[str, measures.Figures]
+
+EMPTY_SCANS = (1, 12, 60)
+SCANS_AFTER = 5
+_NETWORK_SCANS_AFTER = 10
+
+_HALF = (0.25, 0.3, 0.6)
+_STANDING = Box((3.8, 2.5, 0.6), _HALF)
+# A box that hangs: all of the place that it leaves is far from any surface.
+_HANGING = Box((3.8, 1.8, 1.3), _HALF)
+_JUMPED = Box((3.8, 3.2, 1.3), _HALF)
+_CROSSING_STEP = 0.1  # m per scan
+
+
+def appear(setup: Setup) -> Rows:
+    """A box appears in space that was seen free for 1, 12 and 60 scans."""
+    rows = {}
+    for sensor in (depth_camera(), lidar()):
+        state = _new_map(setup)
+        done = 0
+        for empty in EMPTY_SCANS:
+            name = f"appears after {empty}, {sensor.name}"
+            before = _scans(setup, sensor, World(ROOM), range(done, empty))
+            state = library.play(state, _frames(before), f"{name}: empty").state
+            done = empty
+            world = World(ROOM, (_STANDING,))
+            after = _scans(setup, sensor, world, range(empty, empty + SCANS_AFTER))
+            changed = library.play(state, _frames(after), name).state
+            rng = setup.rng(1)
+            rows[name] = (
+                measures.solidity(changed, _STANDING, rng)
+                | measures.visible_side(changed, after, [0])
+                | measures.bounds_hold(changed, *measures.seen_points(sensor, after, world, rng))
+            )
+    return rows
+
+
+def jump(setup: Setup) -> Rows:
+    """A box is seen for 12 scans, and then 1.4 m beside."""
+    rows = {}
+    for sensor in (depth_camera(), lidar()):
+        name = f"jumps, {sensor.name}"
+        before = _scans(setup, sensor, World(ROOM, (_HANGING,)), range(12))
+        state = library.play(_new_map(setup), _frames(before), f"{name}: before").state
+        world = World(ROOM, (_JUMPED,))
+        after = _scans(setup, sensor, world, range(12, 12 + _NETWORK_SCANS_AFTER))
+        early = library.play(state, _frames(after[:SCANS_AFTER]), name).state
+        late = library.play(early, _frames(after[SCANS_AFTER:]), name).state
+        rng = setup.rng(1)
+        figures = (
+            measures.old_place(early, world, _HANGING, rng)
+            | measures.visible_side(early, after[:SCANS_AFTER], [0])
+            | measures.solidity(early, _JUMPED, rng)
+            | measures.bounds_hold(
+                early, *measures.seen_points(sensor, after[:SCANS_AFTER], world, rng)
+            )
+        )
+        # The network has twice the scans.
+        figures["old_network"] = measures.old_place(late, world, _HANGING, rng)["old_network"]
+        figures["side_network_cm"] = measures.visible_side(late, after, [0])["side_network_cm"]
+        rows[name] = figures
+    return rows
+
+
+def _new_map(setup: Setup):
+    return setup.new_map(setup.config(BOUNDS, MAX_RANGE))
+
+
+def _scans(setup: Setup, sensor: Sensor, world: World, numbers: range) -> list[Scan]:
+    return [scan(sensor, world, facing_path(sensor, k), setup.rng(0, k)) for k in numbers]
+
+
+def _frames(scans: list[Scan]) -> list[Frame]:
+    return [Frame(each.cloud, each.pose) for each in scans]
