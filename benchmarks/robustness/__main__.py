@@ -8,10 +8,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.robustness import changes
+from benchmarks.robustness import changes, faults, movers
 from benchmarks.robustness.library import Setup
 
-SCENARIOS = {"appear": changes.appear, "jump": changes.jump}
+SCENARIOS = {
+    "appear": changes.appear,
+    "jump": changes.jump,
+    "cross": movers.cross,
+    "walk": movers.walk,
+    "arm": movers.arm,
+    "faults": lambda setup: faults.faults(setup, Path("../shared/data")),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,11 +1,11 @@
-"""Scenarios of things that appear, jump or cross between scans."""
+"""Scenarios of things that appear or jump between scans."""
 
 from __future__ import annotations
 
 from benchmarks.robustness import library, measures
-from benchmarks.robustness.library import Frame, Setup
-from benchmarks.robustness.scenes import BOUNDS, MAX_RANGE, ROOM, facing_path
-from benchmarks.robustness.sensors import Scan, Sensor, depth_camera, lidar, scan
+from benchmarks.robustness.library import Setup
+from benchmarks.robustness.scenes import ROOM, frames_of, new_map, scan_all
+from benchmarks.robustness.sensors import SENSORS
 from benchmarks.robustness.worlds import Box, World
 
 Rows = dict[str, measures.Figures]
@@ -19,23 +19,22 @@ _STANDING = Box((3.8, 2.5, 0.6), _HALF)
 # A box that hangs: all of the place that it leaves is far from any surface.
 _HANGING = Box((3.8, 1.8, 1.3), _HALF)
 _JUMPED = Box((3.8, 3.2, 1.3), _HALF)
-_CROSSING_STEP = 0.1  # m per scan
 
 
 def appear(setup: Setup) -> Rows:
     """A box appears in space that was seen free for 1, 12 and 60 scans."""
     rows = {}
-    for sensor in (depth_camera(), lidar()):
-        state = _new_map(setup)
+    world = World(ROOM, (_STANDING,))
+    for sensor in (make() for make in SENSORS.values()):
+        state = new_map(setup)
         done = 0
         for empty in EMPTY_SCANS:
             name = f"appears after {empty}, {sensor.name}"
-            before = _scans(setup, sensor, World(ROOM), range(done, empty))
-            state = library.play(state, _frames(before), f"{name}: empty").state
+            before = scan_all(setup, sensor, lambda _: World(ROOM), range(done, empty))
+            state = library.play(state, frames_of(before), f"{name}: empty").state
             done = empty
-            world = World(ROOM, (_STANDING,))
-            after = _scans(setup, sensor, world, range(empty, empty + SCANS_AFTER))
-            changed = library.play(state, _frames(after), name).state
+            after = scan_all(setup, sensor, lambda _: world, range(empty, empty + SCANS_AFTER))
+            changed = library.play(state, frames_of(after), name).state
             rng = setup.rng(1)
             rows[name] = (
                 measures.solidity(changed, _STANDING, rng)
@@ -48,14 +47,14 @@ def appear(setup: Setup) -> Rows:
 def jump(setup: Setup) -> Rows:
     """A box is seen for 12 scans, and then 1.4 m beside."""
     rows = {}
-    for sensor in (depth_camera(), lidar()):
+    world = World(ROOM, (_JUMPED,))
+    for sensor in (make() for make in SENSORS.values()):
         name = f"jumps, {sensor.name}"
-        before = _scans(setup, sensor, World(ROOM, (_HANGING,)), range(12))
-        state = library.play(_new_map(setup), _frames(before), f"{name}: before").state
-        world = World(ROOM, (_JUMPED,))
-        after = _scans(setup, sensor, world, range(12, 12 + _NETWORK_SCANS_AFTER))
-        early = library.play(state, _frames(after[:SCANS_AFTER]), name).state
-        late = library.play(early, _frames(after[SCANS_AFTER:]), name).state
+        before = scan_all(setup, sensor, lambda _: World(ROOM, (_HANGING,)), range(12))
+        state = library.play(new_map(setup), frames_of(before), f"{name}: before").state
+        after = scan_all(setup, sensor, lambda _: world, range(12, 12 + _NETWORK_SCANS_AFTER))
+        early = library.play(state, frames_of(after[:SCANS_AFTER]), name).state
+        late = library.play(early, frames_of(after[SCANS_AFTER:]), name).state
         rng = setup.rng(1)
         figures = (
             measures.old_place(early, world, _HANGING, rng)
@@ -70,15 +69,3 @@ def jump(setup: Setup) -> Rows:
         figures["side_network_cm"] = measures.visible_side(late, after, [0])["side_network_cm"]
         rows[name] = figures
     return rows
-
-
-def _new_map(setup: Setup):
-    return setup.new_map(setup.config(BOUNDS, MAX_RANGE))
-
-
-def _scans(setup: Setup, sensor: Sensor, world: World, numbers: range) -> list[Scan]:
-    return [scan(sensor, world, facing_path(sensor, k), setup.rng(0, k)) for k in numbers]
-
-
-def _frames(scans: list[Scan]) -> list[Frame]:
-    return [Frame(each.cloud, each.pose) for each in scans]

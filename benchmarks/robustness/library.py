@@ -40,12 +40,12 @@ class Played(NamedTuple):
     Attributes:
         state: The map.
         flags: The flags of each update by itself, as bits of `hio.Flag`.
-        refused: The messages of updates that raised a ValueError and left the map as it was.
+        refused: The message of each update that raised a ValueError and left the map as it was.
     """
 
     state: hio.MapState
     flags: list[int]
-    refused: list[str]
+    refused: list[str | None]
 
 
 class Setup(NamedTuple):
@@ -77,11 +77,27 @@ def accepts(argument: str) -> bool:
     return argument in _ACCEPTED
 
 
+def moving_rows(before: hio.MapState, after: hio.MapState, frame: Frame) -> np.ndarray | None:
+    """A mask of the rows of a cloud that the map calls moving.
+
+    Args:
+        before: The map before the update.
+        after: The map after it.
+        frame: What the update was given.
+
+    Returns:
+        (n,) bool; None if this version has no such function.
+    """
+    del after
+    find = getattr(hio, "moving_rows", None)
+    return None if find is None else np.asarray(find(before, frame.cloud, frame.pose))
+
+
 def play(
     state: hio.MapState,
     frames: Iterable[Frame],
     name: str,
-    after: Callable[[int, hio.MapState], None] | None = None,
+    after: Callable[[int, hio.MapState, hio.MapState], None] | None = None,
 ) -> Played:
     """Updates a map with frames.
 
@@ -89,7 +105,7 @@ def play(
         state: The map; it stays valid.
         frames: The frames.
         name: Label of the progress bar.
-        after: Called with the number of each frame and the map after it.
+        after: Called with the number of each frame, the map before and the map after it.
 
     Returns:
         The map after them.
@@ -103,14 +119,16 @@ def play(
             for key, value in (("robot", frame.robot), ("noise", frame.noise))
             if value is not None and accepts(key)
         }
+        before = state
         try:
             state = hio.update(state.replace(report=report), frame.cloud, frame.pose, **extras)
             flags.append(int(state.report.flags))
+            refused.append(None)
         except ValueError as error:
-            refused.append(str(error))
             flags.append(0)
+            refused.append(str(error))
         if after is not None:
-            after(index, state)
+            after(index, before, state)
     return Played(state, flags, refused)
 
 
@@ -122,42 +140,25 @@ def flag_names(bits: Iterable[int]) -> list[str]:
     return [flag.name or str(flag.value) for flag in hio.Flag if raised & flag]
 
 
-class Answers(NamedTuple):
-    """What a map says of points, numpy.
-
-    Attributes:
-        sdf: (n,) m, where nothing has been seen the map's own guess.
-        solid: (n,) m, the distance under unknown="obstacle".
-        solid_grad: (n, 3), its gradient.
-        lower: (n,) m.
-        network: (n,) m, by the network alone.
-    """
-
-    sdf: np.ndarray
-    solid: np.ndarray
-    solid_grad: np.ndarray
-    lower: np.ndarray
-    network: np.ndarray
+def sdf(state: hio.MapState, points: np.ndarray) -> np.ndarray:
+    """Distances (n,) m at points (n, 3) m; where nothing has been seen, the map's own guess."""
+    return _in_chunks(lambda chunk: hio.sdf(state, chunk, "network"), points)
 
 
-def ask(state: hio.MapState, points: np.ndarray) -> Answers:
-    """Asks a map about points.
+def solid_sdf(state: hio.MapState, points: np.ndarray) -> np.ndarray:
+    """Distances (n,) m at points (n, 3) m, with unseen space as an obstacle."""
+    return _in_chunks(lambda chunk: hio.sdf(state, chunk, "obstacle"), points)
 
-    Args:
-        state: The map.
-        points: (n, 3) m, world.
 
-    Returns:
-        Its answers.
-    """
-    points = np.asarray(points, np.float32)
-    parts = []
-    for start in range(0, max(len(points), 1), _CHUNK):
-        chunk = points[start : start + _CHUNK]
-        padded = np.zeros((_CHUNK, 3), np.float32)
-        padded[: len(chunk)] = chunk
-        parts.append([np.asarray(each)[: len(chunk)] for each in _ask(state, padded)])
-    return Answers(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+def network_sdf(state: hio.MapState, points: np.ndarray) -> np.ndarray:
+    """Distances (n,) m at points (n, 3) m by the network alone."""
+    alone = state.replace(config=dataclasses.replace(state.config, grid_share=0.0))
+    return sdf(alone, points)
+
+
+def lower(state: hio.MapState, points: np.ndarray) -> np.ndarray:
+    """Lower bounds (n,) m of the distance at points (n, 3) m."""
+    return _in_chunks(lambda chunk: hio.query(state, chunk).lower, points)
 
 
 def push_out(
@@ -189,13 +190,12 @@ def is_finite(state: hio.MapState) -> bool:
     return all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
 
 
-def _ask(state: hio.MapState, points: np.ndarray) -> tuple[Any, ...]:
-    obstacle = hio.query(state, points, unknown="obstacle")
-    config = dataclasses.replace(state.config, grid_share=0.0)
-    return (
-        hio.sdf(state, points, unknown="network"),
-        obstacle.sdf,
-        obstacle.grad,
-        obstacle.lower,
-        hio.sdf(state.replace(config=config), points, unknown="network"),
-    )
+def _in_chunks(ask: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, np.float32)
+    answers = np.empty(len(points))
+    for start in range(0, len(points), _CHUNK):
+        chunk = points[start : start + _CHUNK]
+        padded = np.zeros((_CHUNK, 3), np.float32)
+        padded[: len(chunk)] = chunk
+        answers[start : start + _CHUNK] = np.asarray(ask(padded))[: len(chunk)]
+    return answers

@@ -85,6 +85,9 @@ def lidar(rings: int = 16, columns: int = 1024) -> Sensor:
     )
 
 
+SENSORS = {"camera": depth_camera, "lidar": lidar}
+
+
 def scan(sensor: Sensor, world: World, pose: np.ndarray, rng: np.random.Generator) -> Scan:
     """Scans a world.
 
