@@ -17,6 +17,7 @@ Figures = dict[str, float]
 DEEP = 0.05  # m, a point that far inside a thing must be solid
 _INSIDE_POINTS = 4000
 _WAYPOINTS = 500
+_WAYPOINT_HEIGHT = 0.3  # m; nearer to the floor the shortest way out of a thing is downward
 _MARGIN = 0.05  # m, waypoints with less clearance are pushed
 _STEP, _STEPS = 0.02, 50  # m; a waypoint has 1 m to leave a thing
 _OLD_PLACE_POINTS = 4000
@@ -47,7 +48,8 @@ def solidity(state: hio.MapState, thing: Thing, rng: np.random.Generator) -> Fig
         leave it if they follow the gradient while their clearance is less than 5 cm.
     """
     inside = draw_inside(thing, _INSIDE_POINTS, DEEP, rng)
-    waypoints = draw_inside(thing, _WAYPOINTS, DEEP, rng)
+    waypoints = draw_inside(thing, 2 * _WAYPOINTS, DEEP, rng)
+    waypoints = waypoints[waypoints[:, 2] > _WAYPOINT_HEIGHT][:_WAYPOINTS]
     pushed = library.push_out(state, waypoints, _MARGIN, _STEP, _STEPS)
     return {
         "solid": float(np.mean(library.solid_sdf(state, inside) < 0)),
@@ -78,21 +80,29 @@ def visible_side(state: hio.MapState, scans: Sequence[Scan], things: Sequence[in
     }
 
 
-def old_place(state: hio.MapState, world: World, thing: Thing, rng: np.random.Generator) -> Figures:
+def old_place(
+    state: hio.MapState,
+    world: World,
+    things: Sequence[Thing],
+    rng: np.random.Generator,
+    least: float = 0.0,
+) -> Figures:
     """Scores the place that a thing has left.
 
     Args:
         state: The map.
         world: The world without it there.
-        thing: The thing where it was.
+        things: The parts of the thing where they were.
         rng: Source of randomness.
+        least: m, points nearer to any surface do not count.
 
     Returns:
         `old`, `old_lower` and `old_network`, the shares of the place where the map, its lower bound
         and the network alone reach 90 % of the true distance.
     """
-    points = draw_inside(thing, _OLD_PLACE_POINTS, 0.0, rng)
-    needed = _REACHED * world.distance(points)
+    points = np.concatenate([draw_inside(each, _OLD_PLACE_POINTS, 0.0, rng) for each in things])
+    truth = world.distance(points)
+    points, needed = points[truth >= least], _REACHED * truth[truth >= least]
     return {
         "old": float(np.mean(library.sdf(state, points) >= needed)),
         "old_lower": float(np.mean(library.lower(state, points) >= needed)),

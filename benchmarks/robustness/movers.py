@@ -25,7 +25,7 @@ _LAG = 3  # scans, 0.3 s
 _ARM_SCANS = 40
 _ARM_RADIUS = 0.05  # m
 _SPHERE_EVERY, _SPHERE_RADIUS = 0.04, 0.06  # m, spheres that cover the arm
-_POST = Capsule((2.12, 2.5, -1.0), (2.12, 2.5, 4.0), 0.04)
+_POST = Capsule((1.98, 2.4, -1.0), (1.98, 2.4, 4.0), 0.04)
 
 
 def cross(setup: Setup) -> Rows:
@@ -82,7 +82,7 @@ def arm_at(number: int, pose: np.ndarray) -> tuple[Capsule, Capsule]:
     )
     elbow = (shoulder + hand) / 2 + [0.08, 0.06, 0.0]
     joints = np.stack([shoulder, elbow, hand]) @ pose[:3, :3].T + pose[:3, 3]
-    first, second, third = (tuple(float(x) for x in joint) for joint in joints)
+    first, second, third = ((float(joint[0]), float(joint[1]), float(joint[2])) for joint in joints)
     return Capsule(first, second, _ARM_RADIUS), Capsule(second, third, _ARM_RADIUS)
 
 
