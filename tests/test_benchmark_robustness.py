@@ -247,15 +247,14 @@ def made(monkeypatch):
         library, "lower", lambda state, points: state.distance(points) - state.slack
     )
 
-    def sdf_and_grad(state, points, unknown):
-        assert unknown == "obstacle"
+    def sdf_and_grad(state, points):
         sides = [
             state.distance(points + step) - state.distance(points - step)
             for step in 1e-4 * np.eye(3)
         ]
         return state.distance(points), np.stack(sides, axis=1) / 2e-4
 
-    monkeypatch.setattr(hio, "sdf_and_grad", sdf_and_grad)
+    monkeypatch.setattr(library, "solid_sdf_and_grad", sdf_and_grad)
 
 
 BOX = Box((3.8, 2.5, 0.6), (0.25, 0.3, 0.6))
@@ -277,8 +276,8 @@ def test_a_perfect_field_is_solid_and_a_hollow_one_is_not(made):
         measures.solidity(Made(field), BOX, np.random.default_rng(0))
         for field in (FULL.distance, _hollow)
     )
-    assert perfect == {"solid": 1.0, "solid_lower": 1.0, "pushed_out": 1.0}
-    assert hollow["solid"] == hollow["pushed_out"] == 0
+    assert perfect == {"solid": 1.0, "solid_lower": 1.0, "outward": 1.0, "pushed_out": 1.0}
+    assert hollow["solid"] == hollow["outward"] == 0 and hollow["pushed_out"] < 0.05
     assert hollow["solid_lower"] < 0.05
 
 

@@ -24,6 +24,7 @@ def scenarios(data: Path) -> dict[str, Scenario]:
         data: Folder where house_depth.npz may be.
     """
     return {
+        "stand": changes.stand,
         "appear": changes.appear,
         "jump": changes.jump,
         "cross": movers.cross,

@@ -44,6 +44,22 @@ def appear(setup: Setup) -> Rows:
     return rows
 
 
+def stand(setup: Setup) -> Rows:
+    """The same box is there from the start: what a world without change allows."""
+    rows, world = {}, World(ROOM, (_STANDING,))
+    for sensor in (make() for make in SENSORS.values()):
+        name = f"stands from the start, {sensor.name}"
+        scans = scan_all(setup, sensor, lambda _: world, range(12 + SCANS_AFTER))
+        state = library.play(new_map(setup), frames_of(scans), name).state
+        latest, rng = scans[-SCANS_AFTER:], setup.rng(1)
+        rows[name] = (
+            measures.solidity(state, _STANDING, rng)
+            | measures.visible_side(state, latest, [0])
+            | measures.bounds_hold(state, *measures.seen_points(sensor, latest, world, rng))
+        )
+    return rows
+
+
 def jump(setup: Setup) -> Rows:
     """A box is seen for 12 scans, and then 1.4 m beside."""
     rows = {}

@@ -114,7 +114,7 @@ def play(
     for index, frame in enumerate(tqdm(frames, desc=name, unit="update", leave=False)):
         # Sticky flags are cleared before each update, so that each tells of itself.
         report = state.report.replace(flags=jnp.zeros_like(state.report.flags))
-        extras = {
+        extras: dict[str, Any] = {
             key: value
             for key, value in (("robot", frame.robot), ("noise", frame.noise))
             if value is not None and accepts(key)
@@ -161,27 +161,10 @@ def lower(state: hio.MapState, points: np.ndarray) -> np.ndarray:
     return _in_chunks(lambda chunk: hio.query(state, chunk).lower, points)
 
 
-def push_out(
-    state: hio.MapState, points: np.ndarray, margin: float, step: float, count: int
-) -> np.ndarray:
-    """Moves points up the gradient as a trajectory optimizer does, until they are clear.
-
-    Args:
-        state: The map, asked under unknown="obstacle".
-        points: (n, 3) m, world.
-        margin: m; a point with a larger distance is clear and stays.
-        step: m.
-        count: The largest number of steps.
-
-    Returns:
-        (n, 3) m.
-    """
-    points = np.asarray(points, np.float32)
-    for _ in range(count):
-        sdf, grad = (np.asarray(each) for each in hio.sdf_and_grad(state, points, "obstacle"))
-        length = np.maximum(np.linalg.norm(grad, axis=1), 1e-9)
-        points = points + np.where(sdf < margin, step / length, 0)[:, None] * grad
-    return points
+def solid_sdf_and_grad(state: hio.MapState, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (n,) m and gradients (n, 3) at points, with unseen space as an obstacle."""
+    value, grad = hio.sdf_and_grad(state, np.asarray(points, np.float32), "obstacle")
+    return np.asarray(value), np.asarray(grad)
 
 
 def is_finite(state: hio.MapState) -> bool:
