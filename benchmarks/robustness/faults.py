@@ -125,9 +125,9 @@ def _millimeters_from_the_start(setup: Setup, stream: Stream, clean: Clean) -> R
 
 
 def _out_of_range(setup: Setup, stream: Stream, clean: Clean) -> Rows:
-    """The whole stream, and then half of it again, so scaled that no return is in range."""
+    """The whole stream, and then all of it again, so scaled that no return is in range."""
     label = "then all beyond max_range"
-    played = _play(setup, stream, clean.whole, _in_millimeters(stream.frames[::2]), label)
+    played = _play(setup, stream, clean.whole, _in_millimeters(stream.frames), label)
     sdf = library.sdf(played.state, stream.points)
     lower = library.lower(played.state, stream.points)
     through = (sdf > _THROUGH_CLEAR) & (stream.truth < _THROUGH_TRUTH)
