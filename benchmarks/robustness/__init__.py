@@ -1,6 +1,6 @@
 """Robustness: worlds that change, things that move, sensors that lie.
 
-python -m benchmarks.robustness --config light
+    python -m benchmarks.robustness --config light
 
 - `worlds` has shapes with exact distances and a ray caster, `sensors` scans them;
 - `scenes` has the furnished room and the paths of the sensors;

@@ -23,9 +23,9 @@ def gpu() -> str:
     rows = {
         "an update, `Config.default`": "update, default",
         "an update, `Config.paper`": "update, paper",
-        "the same with the slopes of half of the samples": f"update, paper, {_HALF}",
+        "the same, Eikonal loss on half of the samples": f"update, paper, {_HALF}",
         "the paper's training, 10 epochs of 60,000 samples": training,
-        "its training with the slopes of half of the samples": f"{training}, {_HALF}",
+        "its training, Eikonal loss on half of the samples": f"{training}, {_HALF}",
         "102,400 distances with gradient, the paper's network": f"{_QUERY}, the paper's network",
         "102,400 distances with gradient, `Config.default`": f"{_QUERY}, blended, default",
         "1,048,576 distances with gradient, baked at 5 cm": (
@@ -97,7 +97,7 @@ def runs() -> str:
     for label, name in (
         ("`Config.default`", "update, default"),
         ("`Config.paper`", "update, paper"),
-        ("`Config.paper`, slopes of half of the samples", f"update, paper, {_HALF}"),
+        ("`Config.paper`, Eikonal loss on half of the samples", f"update, paper, {_HALF}"),
     ):
         rows = [row for row in (_row(record, name) for record in found) if row]
         cells.append([label, str(len(rows)), *(_range(rows, key) for key in ("median", "p99"))])

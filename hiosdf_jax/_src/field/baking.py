@@ -1,4 +1,4 @@
-"""Bakes a field: samples it once on a lattice, so that inner loops only interpolate."""
+"""Bakes a field: samples it once on a lattice. `lattice` interpolates the samples in inner loops."""
 
 from __future__ import annotations
 

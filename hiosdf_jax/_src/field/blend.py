@@ -1,8 +1,8 @@
 """Answers of a live map: the grid and the network, blended into one distance.
 
 Near surfaces the grid's patches are more accurate, and the network smooths the edges between them.
-Beyond the grid's horizon the network answers alone. It also answers alone in unseen space, where
-the grid guesses the side of a surface and the guess may jump.
+Beyond the grid's horizon the answer fades to that of the network. It also does so in unseen space,
+where the grid guesses the side of a surface and the guess may jump.
 
 `lattice` has the same four functions for a baked field: `bounds`, `sdf`, `frontier`, `lower`.
 """

@@ -1,4 +1,4 @@
-"""The check that a pose is rigid."""
+"""The check that a pose is rigid, for `posed_cloud` outside jit and `mapping.pipeline` inside."""
 
 from __future__ import annotations
 

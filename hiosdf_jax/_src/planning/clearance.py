@@ -1,4 +1,4 @@
-"""Clearance of spheres."""
+"""Clearance of spheres; `robot.spheres` places those of a robot."""
 
 from __future__ import annotations
 
