@@ -1,4 +1,4 @@
-"""Readers of recorded streams, one module per layout, behind one protocol (`Stream`).
+"""Readers of recorded streams, one module per format, behind one protocol (`Stream`).
 
 from hiosdf_jax import datasets
 

@@ -30,7 +30,7 @@ SHARP_CONFIG = dataclasses.replace(
     CONFIG, near_samples=2000, far_samples=4000, hidden_width=64, epochs=20, max_points=2000
 )
 
-# A box that `grow` can make of the room's. Most of it is far from all walls.
+# A box to which `grow` can enlarge the room's. Most of it is far from all walls.
 LARGER_BOUNDS = ((-2.05, -1.0, -1.5), (1.2, 3.0, 0.8))
 
 # Not on faces of voxels, where rounding decides which voxel a return falls in.

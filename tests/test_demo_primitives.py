@@ -71,8 +71,8 @@ def sample_surface(kind, n=200):
         caps = np.where(caps[:, 2:] > 0, caps + shift, caps - shift)
         return np.concatenate([caps, tube(*size)])
     phi, r = grid(angle, np.linspace(0, size[0], n))
-    disc = np.stack([r * np.cos(phi), r * np.sin(phi), np.full_like(r, size[1])], axis=1)
-    return np.concatenate([disc, disc * [1, 1, -1], tube(*size)])
+    disk = np.stack([r * np.cos(phi), r * np.sin(phi), np.full_like(r, size[1])], axis=1)
+    return np.concatenate([disk, disk * [1, 1, -1], tube(*size)])
 
 
 def is_inside(kind, p):

@@ -130,7 +130,7 @@ def test_a_shell_block_has_commands_that_exist(block):
 
 
 def anchors(page):
-    """What a code host makes of a page's headings."""
+    """The anchors that a code host gives to a page's headings."""
     titles = re.findall(r"^#+ (.*)$", _BLOCK.sub("", page.read_text("utf-8")), re.M)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 

@@ -54,7 +54,7 @@ def test_a_maps_frontier_is_the_distance_to_unseen_voxels_and_to_its_border(room
     expected = 0.1 * brute_force(padded, CONFIG.frontier_voxels)[1:-1, 1:-1, 1:-1]
     step = CONFIG.frontier_horizon / 127
     np.testing.assert_array_equal(
-        room_map.grid.derived.frontier, np.clip(np.floor(expected / step + 1e-4), -127, 127)
+        room_map.grid.derived.frontier_steps, np.clip(np.floor(expected / step + 1e-4), -127, 127)
     )
     index = np.argwhere(np.ones(seen.shape, bool))
     centers = np.asarray(geometry.voxel_center(CONFIG, jnp.asarray(index)))

@@ -172,7 +172,7 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
         "grid.surface.nearest": derived.nearest,
         "grid.surface.sdf": derived.sdf,
         "grid.surface.doubt": derived.doubt,
-        "grid.surface.frontier": derived.frontier,
+        "grid.surface.frontier": derived.frontier_steps,
         "network.params.params.Dense_1.kernel": network.params["params"]["Dense_1"]["kernel"],
         "network.served.params.Dense_1.kernel": network.average["params"]["Dense_1"]["kernel"],
         "network.served.params.Dense_2.bias": network.average["params"]["Dense_2"]["bias"],

@@ -11,7 +11,7 @@ from hiosdf_jax.view import save_slices
 BOUNDS = ((-2.0, -1.0, 0.0), (2.0, 1.0, 1.0))
 
 
-def disc(points):
+def disk(points):
     return np.linalg.norm(points[:, :2], axis=-1) - 0.5
 
 
@@ -23,9 +23,9 @@ def test_errors_show_their_sign(tmp_path):
     errors = {0.2: -0.2, 0.5: 0.0, 0.8: 0.2}
 
     def wrong(points):
-        return disc(points) + np.interp(points[:, 2], list(errors), list(errors.values()))
+        return disk(points) + np.interp(points[:, 2], list(errors), list(errors.values()))
 
-    save_slices(tmp_path / "slices.png", wrong, disc, BOUNDS, list(errors))
+    save_slices(tmp_path / "slices.png", wrong, disk, BOUNDS, list(errors))
     image = imread(tmp_path / "slices.png")
     column = image[:, 2 * image.shape[1] // 3 :][: int(0.85 * image.shape[0])]  # the errors
     scale = colormaps["PuOr_r"]
@@ -40,7 +40,7 @@ def test_queries_have_one_shape_and_the_given_heights(tmp_path):
 
     def sdf(points):
         asked.append(points)
-        return disc(points)
+        return disk(points)
 
     save_slices(tmp_path / "a.png", sdf, None, BOUNDS, [0.25, 0.75])
     assert {points.shape for points in asked} == {(slices._CHUNK, 3)}
@@ -57,14 +57,14 @@ def test_unobserved_space_is_gray_and_the_path_green(tmp_path):
         green = (image[..., 1] > image[..., 0] + 0.3) & (image[..., 1] > image[..., 2] + 0.3)
         return green.any(axis=0).mean()
 
-    save_slices(tmp_path / "a.png", disc, None, BOUNDS, [0.5])
+    save_slices(tmp_path / "a.png", disk, None, BOUNDS, [0.5])
     plain = imread(tmp_path / "a.png")
 
     def seen(points):
         return (points[:, 0] < 0) | (points[:, 1] < 0)
 
     path_world = np.array([[-1.5, -0.5, 0.5], [1.5, 0.7, 0.5]])
-    save_slices(tmp_path / "b.png", disc, None, BOUNDS, [0.5], path_world, seen)
+    save_slices(tmp_path / "b.png", disk, None, BOUNDS, [0.5], path_world, seen)
     drawn = imread(tmp_path / "b.png")
     gray = (0.78, 0.78, 0.78)
     assert share_of(plain, gray) < 0.01
@@ -84,11 +84,11 @@ def test_zeros_in_unobserved_space_are_not_drawn(tmp_path):
         return np.full(len(points), False)
 
     def shell(points):
-        return np.abs(disc(points)) < 0.05
+        return np.abs(disk(points)) < 0.05
 
-    save_slices(tmp_path / "a.png", disc, None, BOUNDS, [0.5], observed=nothing)
-    save_slices(tmp_path / "b.png", disc, None, BOUNDS, [0.5], observed=shell)
-    save_slices(tmp_path / "c.png", lambda p: disc(p) + 9, None, BOUNDS, [0.5], observed=nothing)
+    save_slices(tmp_path / "a.png", disk, None, BOUNDS, [0.5], observed=nothing)
+    save_slices(tmp_path / "b.png", disk, None, BOUNDS, [0.5], observed=shell)
+    save_slices(tmp_path / "c.png", lambda p: disk(p) + 9, None, BOUNDS, [0.5], observed=nothing)
     unseen, seen, none = (black(imread(tmp_path / name)) for name in ("a.png", "b.png", "c.png"))
     assert abs(unseen - none) < 50 < 200 < seen - none
 
@@ -96,15 +96,15 @@ def test_zeros_in_unobserved_space_are_not_drawn(tmp_path):
 @pytest.mark.filterwarnings("error")
 def test_a_map_without_observed_space_is_drawn(tmp_path):
     save_slices(
-        tmp_path / "a.png", disc, disc, BOUNDS, [0.5], observed=lambda p: np.full(len(p), False)
+        tmp_path / "a.png", disk, disk, BOUNDS, [0.5], observed=lambda p: np.full(len(p), False)
     )
     assert share_of(imread(tmp_path / "a.png"), (0.78, 0.78, 0.78)) > 0.3
 
 
 def test_messages_name_the_wrong_argument(tmp_path):
     with pytest.raises(ValueError, match="heights is empty"):
-        save_slices(tmp_path / "a.png", disc, None, BOUNDS, [])
+        save_slices(tmp_path / "a.png", disk, None, BOUNDS, [])
     with pytest.raises(ValueError, match="bounds = "):
-        save_slices(tmp_path / "a.png", disc, None, BOUNDS[::-1], [0.5])
+        save_slices(tmp_path / "a.png", disk, None, BOUNDS[::-1], [0.5])
     with pytest.raises(ValueError, match=r"sdf has shape \(16384, 3\)"):
         save_slices(tmp_path / "a.png", lambda p: p, None, BOUNDS, [0.5])

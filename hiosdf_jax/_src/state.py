@@ -15,11 +15,11 @@ NO_FEATURE = -128
 """`Derived.nearest` of a voxel without a surface patch within the distance horizon."""
 
 FRONTIER_STEPS = 127
-"""`Derived.frontier` counts steps; the frontier horizon is this many steps long."""
+"""`Derived.frontier_steps` counts steps; the frontier horizon is this many steps long."""
 
 
 def frontier_step_m(config: Config) -> float:
-    """Returns the length of a step of `Derived.frontier`, m."""
+    """Returns the length of a step of `Derived.frontier_steps`, m."""
     return config.frontier_horizon / FRONTIER_STEPS
 
 
@@ -27,7 +27,7 @@ class Flag(enum.IntFlag):
     """Problems since the map was made: bits of `Report.flags`, never cleared."""
 
     BAD_POSE = 1
-    """A pose was not finite or not rigid. That update changed nothing else."""
+    """A pose was not finite, not rigid, or 100 km away. That update changed nothing else."""
     EMPTY_CLOUD = 2
     """A cloud had no finite row. That update changed nothing else."""
     POINTS_OUTSIDE = 4
@@ -92,15 +92,15 @@ class Derived(flax.struct.PyTreeNode):
         doubt: Distance of the voxel's center to the nearest voxel in which any ray has ended and
             that is not almost certainly free, m, (X, Y, Z) float16. Carved surfaces and surfaces
             that were hit once count.
-        frontier: Distance of the voxel's center to the nearest voxel that no ray has reached, in
-            steps of 1 / 127 of the frontier horizon; in unobserved voxels, minus the distance to
+        frontier_steps: Distance of the voxel's center to the nearest voxel that no ray has reached,
+            in steps of 1 / 127 of the frontier horizon; in unobserved voxels, minus the distance to
             the nearest observed one, (X, Y, Z) int8.
     """
 
     nearest: jax.Array
     sdf: jax.Array
     doubt: jax.Array
-    frontier: jax.Array
+    frontier_steps: jax.Array
 
 
 class Grid(flax.struct.PyTreeNode):

@@ -44,11 +44,11 @@ examples:
   hiosdf map house_depth.npz --frames 20 --save map.npz
       map the first 20 frames, and keep the map for hio.load("map.npz")
   hiosdf map rgbd_dataset_freiburg1_desk
-      a TUM RGB-D sequence; the layout is recognized from the folder
+      a TUM RGB-D sequence; the format is recognized from the folder
   hiosdf map drive/ --cloud-topic /points --odometry-topic /odom
       a ROS bag with several clouds and no tf
   hiosdf map scans/ --trajectory poses.txt --bounds -5 -5 0 5 5 3 --max-range 8
-      a folder of .ply or .pcd clouds; given both, bounds and range need no first pass
+      a folder of .ply or .pcd clouds; given both, bounds and range need no first reading
   hiosdf map stream.npz --ground-truth house.ply
       score the map against a mesh of the scene
 
@@ -122,7 +122,7 @@ def _plan(options: argparse.Namespace) -> None:
     except ModuleNotFoundError as error:
         if error.name != "jax_mppi":
             raise
-        hint = "--plan needs jax-mppi: pip install 'hiosdf_jax[plan]'"
+        hint = "--plan needs jax-mppi: in a clone, pip install '.[plan]'"
         raise _Failure(hint, _BAD_INPUT) from error
 
     output = options.output or _OUTPUT / "demo_plan"
@@ -199,7 +199,7 @@ def _open(options: argparse.Namespace) -> tuple[Stream, GroundTruth | None]:
 
 
 def _complete(bounds: Any, options: argparse.Namespace, stream: Stream) -> tuple[Any, float]:
-    """Completes bounds and range of the sensor in a first pass over the stream."""
+    """Completes bounds and range of the sensor in a first reading of the stream."""
     from hiosdf_jax._src.datasets.stream import find_bounds
 
     extent = _checked(
@@ -271,12 +271,12 @@ def _message(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    layout = argparse.RawDescriptionHelpFormatter  # keeps the line breaks of the examples
+    help_style = argparse.RawDescriptionHelpFormatter  # keeps the line breaks of the examples
     parser = argparse.ArgumentParser(
         prog="hiosdf",
         description="Signed distance fields from posed point clouds, online.",
         epilog=_EXAMPLES,
-        formatter_class=layout,
+        formatter_class=help_style,
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     common = argparse.ArgumentParser(add_help=False)
@@ -297,7 +297,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Map a simulated, furnished apartment, score the map against exact distances\n"
         "and draw it. Or, with --plan, let a robot explore it.",
         epilog=_DEMO_EXAMPLES,
-        formatter_class=layout,
+        formatter_class=help_style,
     )
     demo.add_argument(
         "--output",
@@ -325,11 +325,9 @@ def _parser() -> argparse.ArgumentParser:
         help="map a recorded stream and score the map",
         description="Map a recorded stream of posed clouds, score the map and draw it.",
         epilog=_MAP_EXAMPLES,
-        formatter_class=layout,
+        formatter_class=help_style,
     )
-    map_.add_argument(
-        "stream", type=Path, metavar="STREAM", help="file or folder; see --format for the layouts"
-    )
+    map_.add_argument("stream", type=Path, metavar="STREAM", help="file or folder; see --format")
     map_.add_argument(
         "--output",
         type=Path,
@@ -357,7 +355,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="mapped box, m, world frame (default: found in a first pass over the stream)",
+        help="mapped box, m, world frame (default: found in a first reading of the stream)",
     )
     size.add_argument(
         "--voxel-size", type=float, metavar="M", help="edge of a voxel, m (default: 0.1)"
@@ -366,38 +364,38 @@ def _parser() -> argparse.ArgumentParser:
         "--max-range",
         type=float,
         metavar="M",
-        help="returns beyond this range, m, leave no surface (default: found in the first pass)",
+        help="returns beyond this range, m, leave no surface (default: found in a first reading)",
     )
 
-    layouts = map_.add_argument_group("layout of the stream")
-    layouts.add_argument(
+    formats = map_.add_argument_group("format of the stream")
+    formats.add_argument(
         "--format",
         metavar="NAME",
         help="npz, replicacad, scannet, tum, kitti, clouds or rosbag (default: recognized from the "
         "file or folder)",
     )
-    layouts.add_argument(
+    formats.add_argument(
         "--intrinsics",
         type=float,
         nargs=4,
         metavar=("FX", "FY", "CX", "CY"),
         help="tum: intrinsics in pixels (default: from freiburg1, 2 or 3 in the folder's name)",
     )
-    layouts.add_argument(
+    formats.add_argument(
         "--trajectory",
         type=Path,
         metavar="FILE",
         help="clouds: file of poses (default: the only .txt or .tum file in the folder)",
     )
-    layouts.add_argument(
+    formats.add_argument(
         "--cloud-topic", metavar="TOPIC", help="rosbag: topic of the clouds, if there are several"
     )
-    layouts.add_argument(
+    formats.add_argument(
         "--odometry-topic",
         metavar="TOPIC",
         help="rosbag: topic of the odometry, if tf does not contain the motion",
     )
-    layouts.add_argument(
+    formats.add_argument(
         "--world-frame",
         metavar="FRAME",
         help="rosbag: frame of the map (default: the root of the tf tree)",

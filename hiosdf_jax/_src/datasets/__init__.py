@@ -1,1 +1,1 @@
-"""Readers of recorded streams, one layout per module."""
+"""Readers of recorded streams, one format per module."""

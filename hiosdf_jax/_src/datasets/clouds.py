@@ -133,7 +133,7 @@ def _require_pypcd4() -> None:
         import pypcd4  # noqa: F401
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            ".pcd files are read by pypcd4: pip install 'hiosdf_jax[pcd]'"
+            ".pcd files are read by pypcd4: in a clone, pip install '.[pcd]'"
         ) from error
 
 

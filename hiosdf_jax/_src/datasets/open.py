@@ -1,4 +1,4 @@
-"""Opens a recorded stream in any layout, recognized by its file or folder."""
+"""Opens a recorded stream in any format, recognized by its file or folder."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ FORMATS = tuple(_FORMATS)
 
 
 def open_stream(path: str | os.PathLike[str], format: str | None = None, **options: Any) -> Stream:
-    """Opens a recorded stream in any layout that has a reader.
+    """Opens a recorded stream in any format that has a reader.
 
     Example:
         stream = open_stream("rgbd_dataset_freiburg1_desk")
@@ -70,7 +70,7 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
     Args:
         path: The file or folder.
         format: One of `FORMATS`; by default recognized from the file or folder.
-        **options: Options of the layout's reader: `intrinsics` for tum, `trajectory` for clouds,
+        **options: Options of the format's reader: `intrinsics` for tum, `trajectory` for clouds,
             `cloud_topic`, `odometry_topic` and `world_frame` for rosbag.
 
     Returns:
@@ -78,8 +78,8 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
 
     Raises:
         FileNotFoundError: The path, or a file in it, does not exist.
-        ValueError: The layout is unknown or ambiguous, has no such option, or a file is malformed.
-        ModuleNotFoundError: The layout needs a package that is not installed.
+        ValueError: The format is unknown or ambiguous, has no such option, or a file is malformed.
+        ModuleNotFoundError: The format needs a package that is not installed.
     """
     path = Path(path)
     path.stat()

@@ -67,7 +67,7 @@ def rosbag_stream(
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "ROS bags are read by rosbags: pip install 'hiosdf_jax[ros]'"
+            "ROS bags are read by rosbags: in a clone, pip install '.[ros]'"
         ) from error
     path = Path(path)
     with parsing(path, "ROS bag"):
@@ -97,7 +97,7 @@ def rosbag_stream(
             if moved.keys().isdisjoint(path_up(edges, sensor)):
                 raise ValueError(
                     f"{path}: odometry topic {odometry_topic} moves {list(moved)}, expected one of "
-                    f"{path_up(edges, sensor)}, the frames from the cloud's frame upwards"
+                    f"{path_up(edges, sensor)}, the frames from the cloud's frame upward"
                 )
         above = path_up(edges, sensor, world_frame)
         if world_frame is None and not _moves(edges, sensor):
@@ -115,8 +115,8 @@ def rosbag_stream(
         with parsing(f"{path}, {connection.topic} at {start} ns", "PointCloud2"):
             message: Any = reader.deserialize(raw, connection.msgtype)
             cloud = cloud_of(message)
-        upwards = path_up(edges, _name(message.header.frame_id), world_frame)
-        return cloud, transform_up(edges, upwards, _seconds(message.header.stamp))
+        upward = path_up(edges, _name(message.header.frame_id), world_frame)
+        return cloud, transform_up(edges, upward, _seconds(message.header.stamp))
 
     stream = FrameStream(path, len(times), frame)
     weakref.finalize(stream, kept_open.close)

@@ -163,7 +163,7 @@ class Extent(NamedTuple):
 
 
 def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = False) -> Extent:
-    """Finds the box that a stream covers, in one pass with a progress bar.
+    """Finds the box that a stream covers, in one reading with a progress bar.
 
     Stray returns do not enlarge the box: on each side the outermost returns, up to 0.1 % of all,
     are left out unless 10 sampled returns share their cell of 0.5 m. The path of the sensor is

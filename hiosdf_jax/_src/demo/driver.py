@@ -1,6 +1,6 @@
 """Drives a robot to a goal on its map alone: MPPI down a geodesic, with a guard.
 
-MPPI follows the cost to go of the geodesic. The guard passes only controls after which the robot
+MPPI follows the cost to go of the geodesic. The guard accepts only controls after which the robot
 can still stop clear of everything that the map takes as solid.
 """
 

@@ -84,8 +84,8 @@ def scan_from_above(state: MapState, xy: np.ndarray) -> MapState:
     radius, height = 0.45, 4.5
     spots = np.linspace(-radius, radius, 31)
     x, y = (axis.ravel() for axis in np.meshgrid(spots, spots))
-    disc = np.hypot(x, y) <= radius
+    disk = np.hypot(x, y) <= radius
     pose = np.diag([1.0, -1.0, -1.0, 1.0])  # looks down
     pose[:3, 3] = *xy, height
-    cloud = np.column_stack([x[disc], y[disc], np.full(disc.sum(), height)])
+    cloud = np.column_stack([x[disk], y[disk], np.full(disk.sum(), height)])
     return pipeline.update(state, cloud.astype(np.float32), pose)

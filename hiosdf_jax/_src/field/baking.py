@@ -1,4 +1,4 @@
-"""Bakes a field: samples it once on a lattice. `lattice` interpolates the samples in inner loops."""
+"""Bakes a field: samples it once on a lattice, whose samples `lattice` interpolates."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def bake(
     if not isinstance(field, Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
     if (center is None) != (size is None):
-        raise ValueError("center and size define a window, expected both or neither")
+        raise ValueError("center and size define a window: expected both of them or neither")
     if size is None:
         low, high = np.asarray(field.config.bounds)
         size, corner_world = high - low, jnp.asarray(low, jnp.float32)

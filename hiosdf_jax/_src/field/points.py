@@ -47,7 +47,7 @@ def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array
 def sdf_and_grad(
     field: AnyField, points: Any, unknown: Unknown = "network"
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes the signed distance and its gradient with one backward pass for the whole batch.
+    """Computes the signed distance and its gradient by one reverse-mode evaluation of the batch.
 
     Args:
         field: A map, a snapshot of one, or a baked field.

@@ -1,1 +1,1 @@
-"""The coarse global grid (paper, section IV-B), one stage per module."""
+"""The coarse global grid (paper, section IV-B), the stages that keep it, and lookups."""

@@ -57,7 +57,7 @@ def empty_grid(config: Config) -> Grid:
             nearest=jnp.full((*shape, 3), NO_FEATURE, jnp.int8),
             sdf=jnp.full(shape, config.distance_horizon, _STORED),
             doubt=jnp.full(shape, config.distance_horizon, _STORED),
-            frontier=jnp.full(shape, -FRONTIER_STEPS, jnp.int8),
+            frontier_steps=jnp.full(shape, -FRONTIER_STEPS, jnp.int8),
         ),
     )
 

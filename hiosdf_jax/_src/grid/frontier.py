@@ -67,8 +67,8 @@ def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:
     def inside(window: Window) -> jax.Array:
         return _frontier_in(config, grid, window)
 
-    frontier = recompute(config, box, horizon_m, inside)
-    return grid.replace(derived=grid.derived.replace(frontier=frontier))
+    steps = recompute(config, box, horizon_m, inside)
+    return grid.replace(derived=grid.derived.replace(frontier_steps=steps))
 
 
 def _frontier_in(config: Config, grid: Grid, window: Window) -> jax.Array:
@@ -91,4 +91,4 @@ def _frontier_in(config: Config, grid: Grid, window: Window) -> jax.Array:
         .clip(-FRONTIER_STEPS, FRONTIER_STEPS)
         .astype(jnp.int8)
     )
-    return geometry.write_window(grid.derived.frontier, inner_start, steps)
+    return geometry.write_window(grid.derived.frontier_steps, inner_start, steps)

@@ -141,7 +141,7 @@ def frontier_distance(config: Config, surface: Surface, points_world: jax.Array)
         (...) m; positive in observed voxels, negative in others. Differentiable.
     """
     corners = geometry.corners_of(config, points_world)
-    steps = surface.derived.frontier.ravel()
+    steps = surface.derived.frontier_steps.ravel()
     around = steps[corners.flat].astype(jnp.float32) * frontier_step_m(config)
     around = jnp.where(corners.inside, around, -config.frontier_horizon)
     index, _, inside = geometry.voxel_of(config, points_world)

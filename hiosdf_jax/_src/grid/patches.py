@@ -1,6 +1,6 @@
 """Surface patches finer than a voxel: running weighted mean and principal axes of its hits.
 
-The spread of the hits shows what lies in a voxel: a disc is a piece of a wall, a rod is a table
+The spread of the hits shows what lies in a voxel: a disk is a piece of a wall, a rod is a table
 leg, a ball is a corner. Principal axes are stored instead of a covariance matrix. Queries need the
 axes, and the matrix follows from them.
 """
@@ -36,13 +36,17 @@ _LEAST_AREA = 0.2
 _DOUBT_RATIO = 0.02
 
 
-def fuse_hits(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWindow:
+def fuse_hits(
+    config: Config, window: EvidenceWindow, rays: Rays, noise: jax.Array | None = None
+) -> EvidenceWindow:
     """Merges the ends of rays into the surface statistics of their voxels.
 
     Args:
         config: The map's configuration.
         window: The evidence around the sensor.
         rays: The cloud; rows that do not end on a surface change nothing.
+        noise: (a, b) of this cloud's standard deviation a + b r^2, m and 1/m; that of the
+            configuration by default.
 
     Returns:
         The window with new hits, weight, mean and axes.
@@ -63,8 +67,10 @@ def fuse_hits(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWin
     used = (voxel < voxels).astype(jnp.float32)
 
     ranges = length(split(points_world[order] - sensor_world))
-    noise_floor, noise_growth = config.range_noise
+    noise_floor, noise_growth = config.range_noise if noise is None else noise
     weight = used / (1 + noise_growth / noise_floor * ranges**2) ** 2
+    if noise is not None:
+        weight = weight * (config.range_noise[0] / noise_floor) ** 2
     offset = jnp.where(used[:, None] > 0, offset, 0)
 
     def total(values: jax.Array) -> jax.Array:

@@ -11,6 +11,9 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.numerics.vectors import length, split
 
+# Returns this near to the robot's spheres, m, are on the robot: noise moves them.
+_ROBOT_MARGIN_M = 0.03
+
 HIDDEN_VOXELS = 4
 """A ray changes no voxel farther than this behind its end."""
 
@@ -67,3 +70,24 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
         inside=inside,
         sensor_world=sensor_world,
     )
+
+
+def remove_robot(rays: Rays, centers_world: jax.Array, radii: jax.Array) -> Rays:
+    """Removes the returns on the robot itself: they leave no surface and clear no space.
+
+    Args:
+        rays: The cloud.
+        centers_world: Centers of the robot's spheres, (K, 3) m.
+        radii: Their radii, (K,) m.
+
+    Returns:
+        The rays; those that end on the robot are not in range.
+    """
+
+    def add(found: jax.Array, sphere: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        center, radius = sphere
+        distance = length(split(rays.points_world - center))
+        return found | (distance <= radius + _ROBOT_MARGIN_M), None
+
+    found, _ = jax.lax.scan(add, jnp.zeros(rays.ends.shape, bool), (centers_world, radii))
+    return rays._replace(in_range=rays.in_range & ~found, ends=rays.ends & ~found)

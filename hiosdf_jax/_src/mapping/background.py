@@ -52,7 +52,7 @@ class BackgroundMapper:
         """Hands a frame over and returns at once.
 
         Args:
-            cloud: As for `update`. Do not change the array afterwards.
+            cloud: As for `update`. Do not change the array afterward.
             pose: As for `update`.
             stamp: Time of the frame, s on the caller's clock, counted from the start of the run.
 
@@ -85,6 +85,9 @@ class BackgroundMapper:
 
     def close(self) -> MapState:
         """Fuses the waiting frame, ends the thread and returns the map.
+
+        Returns:
+            The map, as `wait` returns it.
 
         Raises:
             RuntimeError: The mapper's thread has failed.

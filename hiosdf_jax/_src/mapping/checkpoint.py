@@ -29,6 +29,7 @@ _FILE_NAMES = {
     "grid.evidence.mean": "grid.surface.mean",
     "grid.evidence.axes": "grid.surface.axes",
     "grid.evidence.": "grid.",
+    "grid.derived.frontier_steps": "grid.surface.frontier",
     "grid.derived.": "grid.surface.",
     "network.average.": "network.served.",
 }

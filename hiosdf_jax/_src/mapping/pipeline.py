@@ -15,7 +15,7 @@ from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.mapping.calibration import initial_optimism
 from hiosdf_jax._src.mapping.stages import begin, run_stages
 from hiosdf_jax._src.network.training import init_network
-from hiosdf_jax._src.numerics.posed_cloud import check_shapes, prepare
+from hiosdf_jax._src.numerics.posed_cloud import check_extras, check_shapes, prepare
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.state import Field, Flag, MapState, Report, field_of
 
@@ -64,7 +64,15 @@ def init(config: Config, key: jax.Array) -> MapState:
     )
 
 
-def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> MapState:
+def update(
+    state: MapState,
+    cloud: Any,
+    pose: Any,
+    *,
+    donate: bool = False,
+    robot: tuple[Any, Any] | None = None,
+    noise: tuple[Any, Any] | None = None,
+) -> MapState:
     """Fuses one posed point cloud into the map.
 
     Pure: the given state stays valid unless it is donated. Outside jit, the arguments are checked,
@@ -80,13 +88,19 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
             The old map, its `report` and a `BackgroundMapper` that began with it become invalid.
             Results of `snapshot`, `bake` and `grow` stay valid. A ValueError donates nothing.
             Inside jit this has no effect: donate the arguments of the outer function instead.
+        robot: Centers (K, 3) m, world frame, and radii (K,) m of spheres that cover the robot, for
+            instance from `planning.place_spheres`. Returns within 3 cm of them leave no surface and
+            clear no space.
+        noise: (a, b) of the standard deviation a + b r^2 of this cloud's returns at range r, m and
+            1/m, for sensors of different quality. By default it is `config.range_noise`.
 
     Returns:
         The new map.
 
     Raises:
-        ValueError: A shape is wrong. Outside jit also: the pose is not finite or not rigid, or the
-            cloud has no finite row.
+        ValueError: A shape is wrong. Outside jit also: the pose is not finite, not rigid or farther
+            than 100 km from the origin, the cloud has no finite row, or a value of `robot` or
+            `noise` is out of range.
 
     Example:
         >>> for cloud, pose in stream:
@@ -94,12 +108,13 @@ def update(state: MapState, cloud: Any, pose: Any, *, donate: bool = False) -> M
     """
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
-    leaves = (*jax.tree.leaves(state), cloud, pose)
+    extras = check_extras(robot, noise)
+    leaves = (*jax.tree.leaves((state, extras)), cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         check_shapes(cloud, pose)
-        return _update(state, jnp.asarray(cloud), jnp.asarray(pose))
+        return _update(state, jnp.asarray(cloud), jnp.asarray(pose), *extras)
     compiled = _update_donating if donate else _update_jit
-    return compiled(state, *prepare(cloud, pose, state.config.max_points))
+    return compiled(state, *prepare(cloud, pose, state.config.max_points), *extras)
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
@@ -147,7 +162,13 @@ def grow(state: MapState, bounds: Any) -> MapState:
     return rest.replace(config=new, grid=grid)
 
 
-def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
+def _update(
+    state: MapState,
+    cloud: jax.Array,
+    pose: jax.Array,
+    robot: tuple[jax.Array, jax.Array] | None = None,
+    noise: jax.Array | None = None,
+) -> MapState:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
@@ -160,11 +181,12 @@ def _update(state: MapState, cloud: jax.Array, pose: jax.Array) -> MapState:
         | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD).astype(jnp.uint32)
     )
     state = state.replace(report=state.report.replace(flags=flags))
-    return jax.lax.cond(usable, _integrate, lambda state, *_: state, state, cloud, finite, pose)
+    arguments = (state, cloud, finite, pose, robot, noise)
+    return jax.lax.cond(usable, _integrate, lambda state, *_: state, *arguments)
 
 
-def _integrate(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> MapState:
-    return run_stages(begin(state, cloud, finite, pose)).state
+def _integrate(state: MapState, *arguments: Any) -> MapState:
+    return run_stages(begin(state, *arguments)).state
 
 
 _update_jit = jax.jit(_update)

@@ -25,7 +25,14 @@ _LATER: Any = None  # a part that a later stage makes
 
 
 class Keys(NamedTuple):
-    """Sources of randomness of one update."""
+    """Sources of randomness of one update.
+
+    Attributes:
+        bound: Returns that calibrate the lower bound.
+        grid: Samples from the grid.
+        cloud: Samples from the cloud.
+        order: Order of the samples in training.
+    """
 
     bound: jax.Array
     grid: jax.Array
@@ -42,6 +49,8 @@ class Step(NamedTuple):
         finite: Rows of the cloud that are returns, (N,) bool.
         pose: (4, 4) float32, T_world_sensor.
         keys: Sources of randomness.
+        robot: Centers (K, 3) and radii (K,) of the robot's spheres, m, world frame, or None.
+        noise: (a, b) of the cloud's noise, or None for that of the configuration.
         rays: The cloud in the world frame.
         window: The evidence around the sensor, float32.
         samples: Training samples.
@@ -54,6 +63,8 @@ class Step(NamedTuple):
     finite: jax.Array
     pose: jax.Array
     keys: Keys
+    robot: tuple[jax.Array, jax.Array] | None = None
+    noise: jax.Array | None = None
     rays: Rays = _LATER
     window: evidence.EvidenceWindow = _LATER
     samples: Samples = _LATER
@@ -69,16 +80,26 @@ class Step(NamedTuple):
 Stage = Callable[[Step], Step]
 
 
-def begin(state: MapState, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Step:
+def begin(
+    state: MapState,
+    cloud: jax.Array,
+    finite: jax.Array,
+    pose: jax.Array,
+    robot: tuple[jax.Array, jax.Array] | None = None,
+    noise: jax.Array | None = None,
+) -> Step:
     """Starts an update: draws its keys and stores the next one in the map."""
     key, grid_key, cloud_key, order_key, bound_key = jax.random.split(state.key, 5)
     keys = Keys(bound=bound_key, grid=grid_key, cloud=cloud_key, order=order_key)
-    return Step(state.replace(key=key), cloud, finite, pose, keys)
+    return Step(state.replace(key=key), cloud, finite, pose, keys, robot, noise)
 
 
 def place_cloud(step: Step) -> Step:
-    """Transforms the cloud to the world frame."""
-    return step._replace(rays=rays.place_cloud(step.config, step.cloud, step.finite, step.pose))
+    """Transforms the cloud to the world frame, without the returns on the robot."""
+    placed = rays.place_cloud(step.config, step.cloud, step.finite, step.pose)
+    if step.robot is not None:
+        placed = rays.remove_robot(placed, *step.robot)
+    return step._replace(rays=placed)
 
 
 def calibrate_bound(step: Step) -> Step:
@@ -95,7 +116,7 @@ def read_window(step: Step) -> Step:
 
 def fuse_hits(step: Step) -> Step:
     """Merges the returns into surface patches (IV-B)."""
-    return step._replace(window=patches.fuse_hits(step.config, step.window, step.rays))
+    return step._replace(window=patches.fuse_hits(step.config, step.window, step.rays, step.noise))
 
 
 def trace_rays(step: Step) -> Step:

@@ -84,7 +84,7 @@ def _predict_jvp(config: Config, primals: Any, tangents: Any) -> tuple[jax.Array
 def predict_with_gradient(
     config: Config, params: Any, points: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Evaluates the network and its gradient by one backward pass for the whole batch.
+    """Evaluates the network and its gradient by one reverse-mode evaluation for the whole batch.
 
     Args:
         config: The map's configuration.

@@ -1,1 +1,1 @@
-"""Gradients of batches, vectors as components, and rigid poses."""
+"""Checks of clouds and poses, gradients, vectors, shifts and chunks."""

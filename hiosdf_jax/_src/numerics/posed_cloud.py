@@ -5,6 +5,9 @@ from __future__ import annotations
 import zlib
 from typing import Any
 
+import jax
+import jax.core
+import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.numerics.rigid import is_rigid
@@ -50,9 +53,58 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
         )
     if not is_rigid(matrix, np):
         raise ValueError(
-            f"{prefix}pose is not rigid, expected a rotation and a translation: {_printed(matrix)}"
+            f"{prefix}pose is not rigid, expected a rotation and a translation of at most 100 km: "
+            f"{_printed(matrix)}"
         )
     return matrix
+
+
+def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
+    """Checks the optional arguments of an update, of tracers only their shapes.
+
+    Args:
+        robot: Centers (K, 3) m and radii (K,) m of the robot's spheres, world frame, or None.
+        noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m, or None.
+
+    Returns:
+        The arguments as float32 arrays, or None.
+
+    Raises:
+        ValueError: A shape is wrong, or a value is not finite or out of range.
+    """
+    if robot is not None:
+        try:
+            centers, radii = robot
+        except (TypeError, ValueError):
+            raise ValueError(f"robot is {robot!r}, expected (centers, radii)") from None
+        shapes = np.shape(centers), np.shape(radii)
+        if len(shapes[0]) != 2 or shapes != ((shapes[0][0], 3), (shapes[0][0],)):
+            raise ValueError(
+                f"robot has centers of shape {shapes[0]} and radii of shape {shapes[1]}, "
+                "expected (K, 3) and (K,)"
+            )
+        _check_values("robot centers", centers, -np.inf)
+        _check_values("robot radii", radii, 0)
+        robot = (jnp.asarray(centers, jnp.float32), jnp.asarray(radii, jnp.float32))
+    if noise is not None:
+        if np.shape(noise) != (2,) and not (isinstance(noise, tuple) and len(noise) == 2):
+            raise ValueError(f"noise is {noise!r}, expected two numbers (a, b)")
+        floor, growth = noise
+        _check_values("noise a", floor, float(np.finfo(np.float32).tiny))
+        _check_values("noise b", growth, 0)
+        noise = jnp.stack([jnp.asarray(floor, jnp.float32), jnp.asarray(growth, jnp.float32)])
+    return robot, noise
+
+
+def _check_values(name: str, values: Any, least: float) -> None:
+    if isinstance(values, jax.core.Tracer):
+        return
+    array = np.asarray(values, float)
+    if not (np.isfinite(array).all() and (array >= least).all()):
+        expected = "finite values" if least == -np.inf else f"finite values >= {least:.3g}"
+        raise ValueError(
+            f"{name} has values from {array.min()} to {array.max()}, expected {expected}"
+        )
 
 
 def finite_rows(cloud: Any) -> np.ndarray:

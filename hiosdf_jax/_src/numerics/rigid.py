@@ -6,6 +6,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
+# Largest coordinate of a position, m; float32 resolves 8 mm there.
+_FARTHEST_M = 1e5
+
 # Largest deviation of R^T R from the identity; real trajectories have few digits.
 _TOLERANCE = 5e-3
 
@@ -18,7 +21,7 @@ def is_rigid(pose: Any, np: Any = jnp) -> Any:
         np: jax.numpy, or numpy to avoid dispatches to a device outside jit.
 
     Returns:
-        () bool; False for a pose that is not finite.
+        () bool; False for a pose that is not finite or farther than 100 km from the origin.
     """
     rotation = pose[:3, :3]
     # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
@@ -26,4 +29,5 @@ def is_rigid(pose: Any, np: Any = jnp) -> Any:
     handed = np.sum(np.cross(rotation[0], rotation[1]) * rotation[2])
     orthonormal = np.all(np.abs(gram - np.eye(3)) <= _TOLERANCE)
     last_row = np.all(np.abs(pose[3] - np.array([0.0, 0, 0, 1])) <= 1e-6)
-    return orthonormal & last_row & (handed > 0) & np.all(np.isfinite(pose))
+    near = np.all(np.abs(pose[:3, 3]) <= _FARTHEST_M)
+    return orthonormal & last_row & (handed > 0) & near & np.all(np.isfinite(pose))

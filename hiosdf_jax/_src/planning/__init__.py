@@ -1,1 +1,1 @@
-"""Clearances and costs for controllers."""
+"""Clearances, costs, sweeps, trajectories and robots for controllers."""

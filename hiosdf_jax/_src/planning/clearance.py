@@ -41,7 +41,7 @@ def sphere_clearance(
 def sphere_clearance_and_grad(
     field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes the clearance of spheres and its gradient, by one backward pass for the batch.
+    """Computes the clearance of spheres and its gradient, by one reverse-mode evaluation.
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.

@@ -105,7 +105,7 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
         import igl
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "distances to a mesh need libigl: pip install 'hiosdf_jax[truth]'"
+            "distances to a mesh need libigl: in a clone, pip install '.[truth]'"
         ) from error
 
     vertices, faces = _corners_and_faces(mesh)
@@ -264,7 +264,7 @@ def _read_grid(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The samples (X, Y, Z) float32 m, NaN for no data; their spacing (3,) and corner (3,), m."""
     grid_file, transform_file = folder / "sdf.npy", folder / "transform.txt"
     try:
-        # Memory-mapped, and converted to float32 below: at 1 cm a flat takes gigabytes.
+        # Memory-mapped, and converted to float32 below: at 1 cm an apartment takes gigabytes.
         grid = np.load(grid_file, mmap_mode="r", allow_pickle=False)
     except (EOFError, ValueError) as error:
         raise ValueError(f"{grid_file}: not a readable npy file ({error})") from error

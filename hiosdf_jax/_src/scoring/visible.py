@@ -32,7 +32,7 @@ class StreamRays(NamedTuple):
 
 
 def read_rays(stream: Stream, max_range: float = np.inf) -> StreamRays:
-    """Draws returns from each frame of a stream, in one pass with a progress bar.
+    """Draws returns from each frame of a stream, in one reading with a progress bar.
 
     Args:
         stream: The frames; bad ones are skipped.

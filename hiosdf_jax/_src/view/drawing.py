@@ -23,8 +23,8 @@ _MESH_SAMPLES = 4e6
 _MESH_FINEST = 0.025  # m
 _SMOOTHINGS = 20  # of the mesh, for its picture
 
-_LEVEL = np.radians(10)  # floors and tables have normals within this angle of upwards
-_TILTED = np.radians(2)  # a world whose z is farther than this from upwards is leveled to draw it
+_LEVEL = np.radians(10)  # floors and tables have normals within this angle of upward
+_TILTED = np.radians(2)  # a world whose z is farther than this from upward is leveled to draw it
 _MARGIN = 0.2  # m, around a leveled world
 _HEADROOM = 2.5  # m above the sensor; rooms are lower, and a slice up there shows little
 
@@ -79,7 +79,7 @@ def level_up(surface: trimesh.Trimesh, up_world: np.ndarray) -> np.ndarray:
     """Finds the direction against gravity from floors and tables.
 
     Args:
-        surface: The mesh of the map, with normals towards free space.
+        surface: The mesh of the map, with normals toward free space.
         up_world: (3,) unit vector, a first guess.
 
     Returns:
@@ -110,7 +110,7 @@ def _draw_slices(
     path = path_world @ world_from_level
     solid = np.asarray(surface.vertices if len(surface.faces) else bounds) @ world_from_level
     if tilted:
-        print("the world's z is not upwards: slices.png is drawn in a leveled frame")
+        print("the world's z does not point up: slices.png is drawn in a leveled frame")
         corners = np.concatenate([solid, path])
         bounds = np.stack([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]).tolist()
     low, high = np.percentile(solid[:, 2], [2, 98])  # floor and ceiling, without specks

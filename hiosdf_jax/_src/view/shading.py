@@ -25,7 +25,7 @@ _MARGIN = 0.03  # share of the picture that stays free on each side
 _FACES_PER_BATCH = 20_000
 _ROWS_PER_BAND = 64
 _AMBIENT = 0.2
-_LIGHT = np.array([-0.35, 0.7, 0.9])  # direction to it: right, level towards the viewer, up
+_LIGHT = np.array([-0.35, 0.7, 0.9])  # direction to it: right, level toward the viewer, up
 _PALETTE = np.array(  # by height, from low to high; pale, so that the shading shows the shape
     [[0.80, 0.86, 0.94], [0.99, 0.93, 0.82], [0.98, 0.76, 0.56], [0.86, 0.57, 0.53]]
 )
@@ -52,7 +52,7 @@ def save_shaded(
 
     Args:
         path: The picture; its suffix names the format (.png).
-        mesh: Faces with normals towards free space, m.
+        mesh: Faces with normals toward free space, m.
         size: (width, height) in pixels.
         up_world: (3,) direction against gravity in the mesh's frame, of any length.
 
@@ -89,7 +89,7 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     normal = normal[shown] / length[shown, None]
     corners = vertices[faces[shown]]  # (F, 3, 3)
 
-    view = corners @ camera.T  # m along the picture's right, up and towards the viewer
+    view = corners @ camera.T  # m along the picture's right, up and toward the viewer
     lower, upper = view.min(axis=(0, 1)), view.max(axis=(0, 1))
     extent = upper - lower
     scale = (1 - 2 * _MARGIN) * min(width / extent[0], height / extent[1])  # pixels / m
@@ -148,7 +148,7 @@ def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) 
 
 
 def _camera_axes(vertices: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The camera's axes as rows, (3, 3): right, up and towards the viewer of the picture."""
+    """The camera's axes as rows, (3, 3): right, up and toward the viewer of the picture."""
     # Any two level axes serve to find the long side.
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)

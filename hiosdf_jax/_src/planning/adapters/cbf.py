@@ -139,7 +139,7 @@ class _Shares(cbfpy.CBFConfig):
             cbf_relaxation_penalty=_PENALTY,
             control_relaxation_penalty=_PENALTY,
             solver_tol=_TOLERANCE,
-            # cbfpy keeps the arguments of its checks, hence the smallest map that passes them.
+            # cbfpy keeps the arguments of its checks, hence the smallest map that satisfies them.
             init_args=(_smallest_map(),),
         )
 

@@ -86,7 +86,7 @@ def arm_clearance_and_grad(
     pose_world_base: Any = None,
     unknown: Unknown = "obstacle",
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes `arm_clearance` and its gradient, by one backward pass for the batch.
+    """Computes `arm_clearance` and its gradient, by one reverse-mode evaluation for the batch.
 
     Args:
         field: A map, a snapshot of one, or a baked snapshot.

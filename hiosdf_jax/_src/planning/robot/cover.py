@@ -70,7 +70,7 @@ def cover_capsule(radius: float, half_length: float, tolerance: float) -> Sphere
 
 
 def cover_box(half: np.ndarray, tolerance: float) -> SphereCover:
-    """Covers a box by spheres around the cells of a lattice, with larger ones inside.
+    """Covers a box by spheres around the equal cells, with larger ones inside.
 
     Args:
         half: (3,) half the lengths of its edges, m.
@@ -79,7 +79,7 @@ def cover_box(half: np.ndarray, tolerance: float) -> SphereCover:
     Returns:
         The spheres.
     """
-    # Candidate lattices, coarse to fine, whose edges divide one of the box's.
+    # Candidate divisions, coarse to fine, whose edges divide one of the box's.
     finest = tolerance / 2
     sizes = np.unique(np.concatenate([h / np.arange(1, np.ceil(h / finest) + 2) for h in half]))
     for size in sizes[::-1]:

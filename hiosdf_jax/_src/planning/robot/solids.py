@@ -128,8 +128,8 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> SignedDis
     index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
     nodes = corner + pitch * index.reshape(-1, 3)
     gap = np.asarray(tree.query(nodes, distance_upper_bound=2 * pitch)[0]).reshape(counts) - error
-    labelled: Any = ndimage.label(gap > pitch / 2)
-    regions = np.asarray(labelled[0])
+    labeled: Any = ndimage.label(gap > pitch / 2)
+    regions = np.asarray(labeled[0])
     enclosed = (regions != regions[0, 0, 0]) & (regions > 0)
     outside = regions == regions[0, 0, 0]
 

@@ -1,0 +1,133 @@
+"""Optional arguments of an update: the robot's spheres and the noise of the sensor."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import CONFIG, arrays_equal, room_cloud
+
+import hiosdf_jax as hio
+from hiosdf_jax._src.mapping import pipeline
+
+CENTERS = np.array([[0.3, 0.05, 0.0], [0.42, 0.05, 0.05]], np.float32)  # m, world
+RADII = np.array([0.06, 0.05], np.float32)
+
+
+def cloud_with_an_arm():
+    """Returns a cloud of the room, the same with rays that end on the arm, and their mask."""
+    cloud, pose = room_cloud(0)
+    on_arm = np.zeros(len(cloud), bool)
+    on_arm[:40] = True
+    rng = np.random.default_rng(1)
+    offsets = rng.normal(size=(40, 3))
+    offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
+    sphere = rng.integers(2, size=40)
+    # On the spheres, up to 2 cm outside.
+    reach = RADII[sphere, None] + rng.uniform(0, 0.02, (40, 1))
+    world = CENTERS[sphere] + reach * offsets
+    covered = cloud.copy()
+    covered[on_arm] = (world - pose[:3, 3]) @ pose[:3, :3]
+    return cloud, covered.astype(np.float32), on_arm, pose
+
+
+def test_returns_on_the_robot_change_nothing(empty_map):
+    _, covered, on_arm, pose = cloud_with_an_arm()
+    without = np.where(on_arm[:, None], np.nan, covered)
+    expected = hio.update(empty_map, without, pose)
+    actual = hio.update(empty_map, covered, pose, robot=(CENTERS, RADII))
+    for part in ("grid", "network", "optimism"):
+        assert arrays_equal(getattr(actual, part), getattr(expected, part)), part
+    assert int(actual.report.points_used) == int(expected.report.points_used)
+    ghost = hio.update(empty_map, covered, pose)
+    assert float(hio.sdf(ghost, CENTERS[0])) < 0.1 < float(hio.sdf(actual, CENTERS[0]))
+
+
+def test_surfaces_just_beyond_the_margin_stay(empty_map):
+    cloud, pose = room_cloud(0)
+    expected = hio.update(empty_map, cloud, pose)
+    point_world = cloud[0] @ pose[:3, :3].T + pose[:3, 3]
+    beside = point_world[None] + [[0.0, 0.0, 0.2]]  # 20 cm away, more than the radius and 3 cm
+    near = np.linalg.norm(cloud @ pose[:3, :3].T + pose[:3, 3] - beside, axis=1).min()
+    assert near > 0.005
+    beside = np.repeat(beside, 2, axis=0)  # as many spheres as above: one compilation
+    radii = np.full(2, max(near - 0.035, 0), np.float32)
+    assert arrays_equal(
+        hio.update(empty_map, cloud, pose, robot=(beside, radii)).grid, expected.grid
+    )
+
+
+def test_the_robot_is_traced(empty_map):
+    _, covered, _, pose = cloud_with_an_arm()
+    padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
+    padded[: len(covered)] = covered
+    traces = []
+
+    @jax.jit
+    def step(state, centers):
+        traces.append(None)
+        return hio.update(state, padded, jnp.asarray(pose), robot=(centers, RADII))
+
+    eager = hio.update(empty_map, covered, pose, robot=(CENTERS, RADII))
+    inside = step(empty_map, CENTERS)
+    step(inside, CENTERS + 0.1)
+    assert len(traces) == 1
+    np.testing.assert_array_equal(inside.grid.evidence.hits, eager.grid.evidence.hits)
+    np.testing.assert_array_equal(inside.grid.evidence.passes, eager.grid.evidence.passes)
+
+
+def test_hits_are_weighted_by_the_noise_of_their_cloud(empty_map):
+    """Two clouds of one point each fall in one voxel, weighted by their inverse variances."""
+    ends = np.array([[0.72, 0.02, 0.03], [0.78, 0.08, 0.06]], np.float32)
+    noises = [(0.004, 0.001), (0.016, 0.003)]
+    state = empty_map
+    for end, noise in zip(ends, noises, strict=True):
+        state = hio.update(state, end[None], np.eye(4), noise=noise)
+    square = np.sum(ends.astype(float) ** 2, axis=1)
+    weight = np.array([1 / (a + b * r) ** 2 for (a, b), r in zip(noises, square, strict=True)])
+    expected = weight @ ends / weight.sum()
+    at = tuple(np.floor(expected / 0.1 + 1e-6).astype(int) - CONFIG.corner_index)
+    center = (np.array(at) + CONFIG.corner_index + 0.5) * 0.1
+    mean = center + 0.1 * np.asarray(state.grid.evidence.mean[at], float)
+    np.testing.assert_allclose(mean, expected, atol=2e-4)  # float16
+    total = CONFIG.range_noise[0] ** 2 * weight.sum()
+    np.testing.assert_allclose(float(state.grid.evidence.root_weight[at]) ** 2, total, rtol=5e-3)
+
+
+def test_the_configurations_noise_is_the_default(empty_map):
+    cloud, pose = room_cloud(0)
+    plain = hio.update(empty_map, cloud, pose)
+    given = hio.update(empty_map, cloud, pose, noise=CONFIG.range_noise)
+    points = np.random.default_rng(0).uniform(-0.9, 0.9, (200, 3)).astype(np.float32)
+    np.testing.assert_allclose(hio.sdf(given, points), hio.sdf(plain, points), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "extras, message",
+    [
+        ({"robot": 3}, "robot is 3, expected"),
+        ({"robot": (CENTERS, RADII[:1])}, r"robot has centers of shape \(2, 3\)"),
+        ({"robot": (CENTERS[:, :2], RADII)}, r"robot has centers of shape \(2, 2\)"),
+        ({"robot": (CENTERS * np.nan, RADII)}, "robot centers has values"),
+        ({"robot": (CENTERS, -RADII)}, "robot radii has values"),
+        ({"noise": 0.01}, "noise is 0.01, expected two numbers"),
+        ({"noise": (0.0, 0.1)}, "noise a has values"),
+        ({"noise": (0.01, -0.1)}, "noise b has values"),
+    ],
+)
+def test_bad_extras_are_refused(empty_map, extras, message):
+    cloud, pose = room_cloud(0)
+    with pytest.raises(ValueError, match=message):
+        hio.update(empty_map, cloud, pose, **extras)
+
+
+def test_a_pose_too_far_away_is_refused(empty_map):
+    cloud, pose = room_cloud(0)
+    pose[0, 3] = 1e20
+    with pytest.raises(ValueError, match="at most 100 km"):
+        hio.update(empty_map, cloud, pose)
+    padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
+    padded[: len(cloud)] = cloud
+    inside = pipeline._update_jit(empty_map, padded, pose)  # what `update` compiles
+    assert hio.Flag(int(inside.report.flags)) == hio.Flag.BAD_POSE
+    flags = empty_map.report.flags
+    assert arrays_equal(inside.replace(report=inside.report.replace(flags=flags)), empty_map)
