@@ -1,7 +1,5 @@
 """A box-shaped room, a sensor that looks around in it, and maps that are small enough for tests."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,11 +21,6 @@ CONFIG = hio.Config.light(
     batches=2,
     warmup_updates=2,
     warmup_epochs=4,
-)
-
-# Large enough to learn the room, not only to run.
-SHARP_CONFIG = dataclasses.replace(
-    CONFIG, near_samples=2000, far_samples=4000, hidden_width=64, epochs=20, max_points=2000
 )
 
 # A box to which `grow` can enlarge the room's. Most of it is far from all walls.
@@ -53,9 +46,11 @@ def room_cloud(seed, count=250, yaw=0.0, position=(0.0, 0.0, 0.0)):
 
 
 def stream(frames=4, count=250):
-    """Posed clouds along a short walk through the room."""
+    """Posed clouds along a short walk through the room; after twelve it starts again."""
+    steps = [i % 12 for i in range(frames)]
     return [
-        room_cloud(i, count, 0.3 * i, (0.1 * i - 0.2, 0.05 * i, 0.02 * i)) for i in range(frames)
+        room_cloud(i, count, 0.3 * i, (0.1 * k - 0.2, 0.05 * k, 0.02 * k))
+        for i, k in enumerate(steps)
     ]
 
 

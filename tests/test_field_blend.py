@@ -13,20 +13,24 @@ from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.state import surface_of
 
+grid_sdf = jax.jit(lookup.grid_sdf, static_argnums=0)
+doubt_distance = jax.jit(lookup.doubt_distance, static_argnums=0)
+network_sdf = jax.jit(blend.network_sdf)
+
 
 @pytest.fixture(scope="module")
 def field(room_map):
     return hio.snapshot(room_map)
 
 
-def points_inside(count=400):
+def points_inside(count=2000):
     return np.random.default_rng(0).uniform(-HALF, HALF, (count, 3)).astype(np.float32)
 
 
 def test_near_surfaces_the_network_corrects_the_grid_by_its_share(field):
     points = points_inside()
-    grid = np.asarray(lookup.grid_sdf(CONFIG, field.surface, jnp.asarray(points)), float)
-    network = np.asarray(blend.network_sdf(field, jnp.asarray(points)), float)
+    grid = np.asarray(grid_sdf(CONFIG, field.surface, points), float)
+    network = np.asarray(network_sdf(field, points), float)
     assert np.abs(network - grid).max() > 0.1 > np.abs(network - grid).min()
     limit = np.minimum(0.1, np.abs(grid))  # surfaces stay where the grid has them
     expected = grid + 0.1 * np.clip(network - grid, -limit, limit)
@@ -37,9 +41,9 @@ def test_near_surfaces_the_network_corrects_the_grid_by_its_share(field):
 def test_beyond_the_horizon_the_network_answers_alone():
     config = dataclasses.replace(CONFIG, bounds=LARGER_BOUNDS)
     field = hio.snapshot(map_of_room(config, jax.random.key(0)))
-    y = np.linspace(0.8, 2.9, 400)
+    y = np.linspace(0.8, 2.9, 2000)
     points = np.stack([0 * y, y, 0 * y], axis=1).astype(np.float32)
-    network = np.asarray(blend.network_sdf(field, jnp.asarray(points)))
+    network = np.asarray(network_sdf(field, points))
     value = np.asarray(hio.sdf(field, points))
     np.testing.assert_allclose(value[y > 1.8], network[y > 1.8], atol=1e-6)
     assert np.abs(value - network)[y < 0.9].max() > 0.01
@@ -49,16 +53,16 @@ def test_beyond_the_horizon_the_network_answers_alone():
 def test_the_papers_map_is_the_network_alone(field):
     paper = field.replace(config=dataclasses.replace(CONFIG, grid_share=0.0))
     points = jnp.asarray(points_inside())
-    network = blend.network_sdf(paper, points)
+    network = network_sdf(paper, points)
     np.testing.assert_allclose(hio.sdf(paper, points), network, atol=1e-6)
 
 
 def test_lower_is_below_and_by_more_where_grid_and_network_disagree(field):
-    points = points_inside(2000)
+    points = points_inside()
     answer = hio.query(field, points)
     slack = np.asarray(answer.sdf) - np.asarray(answer.lower)
     assert (slack > 0).all()
-    gap = np.abs(blend.network_sdf(field, points) - lookup.grid_sdf(CONFIG, field.surface, points))
+    gap = np.abs(network_sdf(field, points) - grid_sdf(CONFIG, field.surface, points))
     order = np.argsort(gap)
     assert slack[order[-500:]].mean() > 1.2 * slack[order[:500]].mean()
     wilder = field.replace(optimism=field.optimism + 1)
@@ -69,9 +73,9 @@ def test_the_error_scale_adds_gap_and_spread(field):
     points = jnp.asarray(points_inside())
     rough = field.surface.replace(axes=field.surface.axes.at[..., 2, :].multiply(200.0))
     field = field.replace(surface=rough)  # the room's walls are smooth
-    nearest = lookup.nearest_patch(CONFIG, field.surface, points)
-    gap = np.abs(blend.network_sdf(field, points) - nearest.sdf)
-    _, scale = blend.cautious_sdf(field, points)
+    nearest = jax.jit(lookup.nearest_patch, static_argnums=0)(CONFIG, field.surface, points)
+    gap = np.abs(network_sdf(field, points) - nearest.sdf)
+    _, scale = jax.jit(blend.cautious_sdf)(field, points)
     spread = np.asarray(nearest.spread)
     assert spread.max() > 0.01
     expected = 0.3 * 0.1 + 0.5 * np.minimum(gap, 0.1) + spread
@@ -83,7 +87,7 @@ def test_beyond_the_bounds_nothing_is_doubtful(field):
     surface = field.surface.replace(derived=derived.replace(doubt=jnp.zeros_like(derived.doubt)))
     low = np.asarray(CONFIG.bounds[0], np.float32)
     face = jnp.asarray([[low[0], 0.05, 0.05], [low[0] + 0.05, 0.05, 0.05]])
-    value = lookup.doubt_distance(CONFIG, surface, face)
+    value = doubt_distance(CONFIG, surface, face)
     np.testing.assert_allclose(value, [0.5 * CONFIG.distance_horizon, 0], atol=1e-5)
 
 
@@ -93,10 +97,10 @@ def test_a_carved_surface_still_counts_for_the_lower_bound(empty_map):
     thing = np.array([[0.45, 0.05, 0.05]] * 3)
     state = hio.update(empty_map, thing, pose)
     here = jnp.asarray(thing[:1], jnp.float32)
-    assert abs(float(lookup.grid_sdf(CONFIG, surface_of(state.grid), here)[0])) < 0.01
+    assert abs(float(grid_sdf(CONFIG, surface_of(state.grid), here)[0])) < 0.01
     wall = np.array([[0.95, 0.1, 0.1]]) + np.random.default_rng(0).uniform(0, 1e-3, (40, 3))
     for _ in range(2):
         state = hio.update(state, wall * [1, 0.5, 0.5], pose)
-    assert float(lookup.grid_sdf(CONFIG, surface_of(state.grid), here)[0]) > 0.3
-    assert float(lookup.doubt_distance(CONFIG, surface_of(state.grid), here)[0]) < 0.1
+    assert float(grid_sdf(CONFIG, surface_of(state.grid), here)[0]) > 0.3
+    assert float(doubt_distance(CONFIG, surface_of(state.grid), here)[0]) < 0.1
     assert float(hio.query(state, here).lower[0]) < 0.05

@@ -20,14 +20,15 @@ def field(room_map):
 
 
 def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypatch):
+    points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (2000, 3)), jnp.float32)
+    seen = np.asarray(hio.query(field, points).observed)
+
     def known(_, points):
         return (points[:, 0] + offset) * 0.5, jnp.full(len(points), 0.5)  # a ratio of x + offset
 
     offset = 1.0
-
+    # Only now: `query` must not be compiled with it.
     monkeypatch.setattr(blend, "cautious_sdf", known)
-    points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 3)), jnp.float32)
-    seen = np.asarray(hio.query(field, points).observed)
     assert seen.mean() > 0.5
     sensor = jnp.asarray([0.3, 0.0, 0.0])
     # A return stands for a piece of surface that grows with its range squared.
@@ -36,20 +37,26 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
     share = np.cumsum(area[ordered]) / area.sum()
     expected = offset + float(points[:, 0][seen][ordered][np.argmax(share >= 0.945)])
 
-    def calibrate(field, ends):
-        rays = rays_to(points, sensor, np.asarray(ends))
-        return float(calibrate_bound(field, rays, jax.random.key(0)))
+    def compiled_calibrate():
+        compiled = jax.jit(lambda *arguments: calibrate_bound(*arguments))
 
-    every = np.ones(5000, bool)
+        def calibrate(field, ends):
+            return float(compiled(field, rays_to(points, sensor, ends), jax.random.key(0)))
+
+        return calibrate
+
+    calibrate = compiled_calibrate()
+
+    every = np.ones(2000, bool)
     assert abs(calibrate(field, every) - expected) < 0.02
     later = field.replace(updates=jnp.int32(1000))
     assert abs(calibrate(later, every) - (0.98 * 9 + 0.02 * expected)) < 0.01
     assert calibrate(field, ~seen) == 9
-    assert calibrate(field, np.zeros(5000, bool)) == 9
+    assert calibrate(field, np.zeros(2000, bool)) == 9
     few = seen & (np.cumsum(seen) <= 1)  # drawn 2,000 times, which is enough
     assert calibrate(field, few) != 9
     offset = -1.0  # the map agrees with all returns, and free space still needs some margin
-    assert calibrate(field, every) == pytest.approx(calibration._LEAST)
+    assert compiled_calibrate()(field, every) == pytest.approx(calibration._LEAST)
 
 
 def test_too_few_observed_returns_calibrate_nothing(field):
@@ -58,4 +65,4 @@ def test_too_few_observed_returns_calibrate_nothing(field):
     seen = np.asarray(hio.query(field, points.astype(np.float32)).observed)
     assert 0 < seen.sum() < 60  # of 2,000 that are drawn with replacement
     rays = rays_to(points, np.zeros(3))
-    assert float(calibrate_bound(field, rays, jax.random.key(0))) == 9
+    assert float(jax.jit(calibrate_bound)(field, rays, jax.random.key(0))) == 9

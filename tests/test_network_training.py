@@ -32,7 +32,8 @@ train = compiled_train()
 def test_losses_are_equations_4_and_5(every):
     config = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, eikonal_every=every)
     params, samples = siren.init_params(config, jax.random.key(0)), some_samples()
-    result = training.losses(config, params, samples.points_world, samples)
+    losses = jax.jit(training.losses, static_argnums=0)
+    result = losses(config, params, samples.points_world, samples)
     used = np.asarray(samples.weight) > 0
     value = numpy_forward(config, params, samples.points_world)
     slope = np.linalg.norm(numpy_gradient(config, params, samples.points_world), axis=1)
@@ -52,7 +53,7 @@ def test_one_step_is_adamw_on_equation_3():
         parts = training.losses(TINY, params, points, samples)
         return TINY.sdf_weight * parts.sdf + TINY.eikonal_weight * parts.eikonal
 
-    gradients = jax.grad(objective)(network.params)
+    gradients = jax.jit(jax.grad(objective))(network.params)
     # The first step of Adam is lr * g / (|g| + eps), after the decay of the weights (AdamW).
     for new, old, g in zip(
         *(jax.tree.leaves(tree) for tree in (trained.params, network.params, gradients)),
@@ -99,8 +100,7 @@ def test_each_group_has_samples_of_all_depths():
         assert np.abs(np.bincount(kind, minlength=4) - len(kind) / 4).max() < 5 * deviation
 
 
-@pytest.mark.parametrize("tile", [1024, 16])
-@pytest.mark.parametrize("every", [1, 2, 4])
+@pytest.mark.parametrize(("every", "tile"), [(1, 1024), (2, 16), (4, 1024), (4, 16)])
 def test_each_slope_counts_once_in_every_few_epochs(monkeypatch, every, tile):
     monkeypatch.setattr(tiles, "_ROWS", tile)
     train = compiled_train()
