@@ -228,7 +228,7 @@ def test_a_task_makes_what_it_needs_and_shares_it(monkeypatch, tmp_path):
 
     monkeypatch.setattr(updates, "map_frames", map_frames)
     monkeypatch.setattr(limits, "measure", measure)
-    monkeypatch.setattr(queries, "ask_map", asked)
+    monkeypatch.setattr(queries, "query_map", asked)
     tasks = plan.plan(setup_of(tmp_path, []))
     assert made == []
     for _ in range(2):
