@@ -60,8 +60,8 @@ TINY = dataclasses.replace(
 # Stands for the command that maps a whole stream, which takes too long for a test.
 CHECKS_ITS_ARGUMENTS = """
 import sys, pathlib
-command, stream, option, output = sys.argv[1:]
-assert (command, option) == ("map", "--output")
+command, stream, *config, option, output = sys.argv[1:]
+assert (command, config, option) == ("map", ["--config", "light"], "--output")
 assert pathlib.Path(stream).is_file() and pathlib.Path(output).is_dir()
 """
 
