@@ -1,6 +1,6 @@
 """A fast robot and an obstacle behind a corner, under both policies for unseen space.
 
-    python benchmarks/blind_corner.py --seeds 100 --output blind_corner.json
+    python -m benchmarks.blind_corner --seeds 100 --output blind_corner.json
 
 The goal is around the corner of a corridor. A box stands where it cannot be seen from the start.
 The robot scans, maps and drives by MPPI, once with unseen space as an obstacle and once with the
@@ -14,12 +14,14 @@ import dataclasses
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import hiosdf_jax as hio
+from benchmarks import records
 from hiosdf_jax._src.demo.driver import Driver, head, make_driver, make_task
 from hiosdf_jax._src.demo.geodesic import lay_plane
 from hiosdf_jax._src.demo.robot import Robot, motion
@@ -182,7 +184,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
-    result = {}
+    result: dict[str, Any] = dict(records.provenance())
     for unknown in ("obstacle", "network"):
         driver = make_driver(ROBOT, unknown, jax.random.key(0), horizon=20)
         begin = time.perf_counter()
@@ -194,7 +196,7 @@ def main() -> None:
         }
         print(unknown, json.dumps(result[unknown]))
     if options.output:
-        options.output.write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+        records.write(options.output, result)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Runs the exploring robot over many seeds, each in its own process.
 
-    python benchmarks/explore.py --seeds 20 --output explore.json
+    python -m benchmarks.explore --seeds 20 --output explore.json
 
 It counts reached goals and collisions, and measures the wall time of the whole command, including
 start, compilation and drawing.
@@ -17,6 +17,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+
+from benchmarks import records
 
 
 def run(seed: int, folder: Path) -> dict:
@@ -59,7 +61,7 @@ def main() -> None:
     summary = summarize(runs)
     print(json.dumps(summary))
     if options.output:
-        options.output.write_text(json.dumps(summary | {"each": runs}, indent=2) + "\n", "utf-8")
+        records.write(options.output, records.provenance() | summary | {"each": runs})
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Times clearances of many spheres with gradients by baked field, field and network.
 
-    python benchmarks/planning.py                  # 1,048,576 spheres: a GPU
-    python benchmarks/planning.py --count 65536    # two CPU cores
+    python -m benchmarks.planning                  # 1,048,576 spheres: a GPU
+    python -m benchmarks.planning --count 65536    # two CPU cores
 
 The calls take turns, so that other load on the machine affects them alike. Times and ratios to the
 baked field are medians with the 10th and 90th percentile over the turns, without compilation and
@@ -13,7 +13,6 @@ clearance of as many spheres on the baked field, without gradient. All of them u
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from functools import partial
@@ -26,8 +25,9 @@ import numpy as np
 from tqdm import tqdm
 
 import hiosdf_jax as hio
+from benchmarks import records
+from benchmarks.variants import VARIANTS
 from hiosdf_jax import datasets, demo, planning
-from hiosdf_jax._src.field import blend
 
 RADIUS = 0.1  # m
 MOTION = 0.05  # m, the length of a swept motion
@@ -53,7 +53,7 @@ def network_clearance_and_grad(
     field: hio.Field, centers_world: jax.Array, radii: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Computes `sphere_clearance_and_grad` by the network alone."""
-    value, gradient = blend.network_sdf_and_grad(field, centers_world)
+    value, gradient = VARIANTS["network"](field, centers_world)
     return value - radii, gradient
 
 
@@ -68,12 +68,6 @@ def take_turns(calls: dict[str, Callable[[], Any]], turns: int) -> dict[str, np.
             if turn >= 0:
                 times[name].append(elapsed)
     return {name: np.array(values) for name, values in times.items()}
-
-
-def spread(values: np.ndarray) -> dict[str, float]:
-    """Returns the median and percentiles."""
-    names = {"p10": 10, "median": 50, "p90": 90}
-    return {name: float(np.percentile(values, share)) for name, share in names.items()}
 
 
 def measure(field: hio.Field, count: int, resolution: float, turns: int) -> dict[str, Any]:
@@ -99,9 +93,11 @@ def measure(field: hio.Field, count: int, resolution: float, turns: int) -> dict
     )
     return {
         "baked_shape": list(baked.sdf.shape),
-        "times_ms": {name: spread(values) for name, values in times.items()},
+        "times_ms": {name: records.percentiles(values) for name, values in times.items()},
         "ratios_to_baked": {
-            name: spread(times[name] / times["baked"]) for name in times if name != "baked"
+            name: records.percentiles(times[name] / times["baked"])
+            for name in times
+            if name != "baked"
         },
     }
 
@@ -127,9 +123,9 @@ def main() -> None:
         "config": arguments.config,
         "resolution_m": arguments.resolution,
         "turns": arguments.turns,
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
-    } | measure(field, arguments.count, arguments.resolution, arguments.turns)
+    }
+    record |= records.provenance()
+    record |= measure(field, arguments.count, arguments.resolution, arguments.turns)
     print(f"{arguments.count} spheres, Config.{arguments.config}, {record['device']}")
     for name, times in record["times_ms"].items():
         ratio = record["ratios_to_baked"].get(name)
@@ -137,8 +133,7 @@ def main() -> None:
         if ratio:
             line += f"  {ratio['median']:.1f} x baked ({ratio['p10']:.1f} to {ratio['p90']:.1f})"
         print(line)
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(record, indent=1))
+    records.write(arguments.output, record)
 
 
 if __name__ == "__main__":

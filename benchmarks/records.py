@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from hiosdf_jax._src.command.report import to_json
 
@@ -59,6 +61,25 @@ def write(path: Path, value: Any) -> None:
 def rounded(value: float, digits: int = 6) -> float:
     """Rounds a number to significant digits; tables show fewer."""
     return float(f"{value:.{digits}g}")
+
+
+def percentiles(
+    values: Sequence[float] | np.ndarray, shares: Sequence[int] = (10, 50, 90)
+) -> dict[str, float]:
+    """Computes percentiles of measurements.
+
+    Args:
+        values: The measurements.
+        shares: Percentages; 50 is the median.
+
+    Returns:
+        {"p10": ..., "median": ..., "p90": ...} for the default shares; empty without measurements.
+    """
+    if not len(values):
+        return {}
+    found = np.percentile(np.asarray(values, float), shares)
+    names = ("median" if share == 50 else f"p{share}" for share in shares)
+    return {name: float(value) for name, value in zip(names, found, strict=True)}
 
 
 def _lay_out(value: Any, indent: str) -> str:

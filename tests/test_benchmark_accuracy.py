@@ -84,8 +84,8 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
         states.append(state)
 
     def score(state, frame, **settings):
-        ask = functools.partial(hio.sdf_and_grad, hio.snapshot(state))
-        return scoring.evaluate(ask, truth, last_frame=frame, **settings)
+        query = functools.partial(hio.sdf_and_grad, hio.snapshot(state))
+        return scoring.evaluate(query, truth, last_frame=frame, **settings)
 
     record, real = json.loads(output.read_text())
     assert (record["stream"], record["seed"], record["frames"]) == ("room", 0, FRAMES)
@@ -102,8 +102,8 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     assert blended["over_time"][0]["visible_cm"] == pytest.approx(first, rel=1e-4)
     assert blended["over_time"][0]["surface_cm"] is None  # NaN, which JSON does not have
     grid = record["variants"]["grid"]
-    ask_grid = jax.jit(grid_sdf, static_argnums=0)
-    surface = ask_grid(CONFIG, surface_of(state.grid), truth.surface_points_world)
+    query_grid = jax.jit(grid_sdf, static_argnums=0)
+    surface = query_grid(CONFIG, surface_of(state.grid), truth.surface_points_world)
     mean_cm = 100 * float(np.abs(surface).mean())
     assert grid["scores"]["surface_cm"] == pytest.approx(mean_cm, rel=1e-4)
     assert grid["bands"]["5-20 cm"]["visible_cm"] < 3
@@ -117,7 +117,7 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     cloud, pose = stream[5]
     returns = cloud + pose[:3, 3]
     observed = np.asarray(hio.query(held, returns).observed)
-    error_cm = 100 * np.abs(ask_grid(CONFIG, surface_of(held.grid), returns))[observed]
+    error_cm = 100 * np.abs(query_grid(CONFIG, surface_of(held.grid), returns))[observed]
     assert len(error_cm) > 300 and np.median(error_cm) < 5
     median_cm = real["variants"]["grid"]["scores"]["median_cm"]
     assert median_cm == pytest.approx(np.median(error_cm), rel=1e-3)

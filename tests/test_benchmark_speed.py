@@ -60,8 +60,8 @@ TINY = dataclasses.replace(
 # Stands for the command that maps a whole stream, which takes too long for a test.
 CHECKS_ITS_ARGUMENTS = """
 import sys, pathlib
-command, stream, option, output = sys.argv[1:]
-assert (command, option) == ("map", "--output")
+command, stream, *config, option, output = sys.argv[1:]
+assert (command, config, option) == ("map", ["--config", "light"], "--output")
 assert pathlib.Path(stream).is_file() and pathlib.Path(output).is_dir()
 """
 
@@ -228,7 +228,7 @@ def test_a_task_makes_what_it_needs_and_shares_it(monkeypatch, tmp_path):
 
     monkeypatch.setattr(updates, "map_frames", map_frames)
     monkeypatch.setattr(limits, "measure", measure)
-    monkeypatch.setattr(queries, "ask_map", asked)
+    monkeypatch.setattr(queries, "query_map", asked)
     tasks = plan.plan(setup_of(tmp_path, []))
     assert made == []
     for _ in range(2):

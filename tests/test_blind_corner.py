@@ -1,39 +1,23 @@
 """The blind-corner benchmark: its ray caster, its scenes, and one run."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import numpy as np
 import pytest
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
+from benchmarks import blind_corner as corner
 from hiosdf_jax._src.demo.driver import make_driver
 from hiosdf_jax._src.demo.sensing import map_config
 
-FILE = Path(__file__).parents[1] / "benchmarks" / "blind_corner.py"
 
-
-@pytest.fixture(scope="module")
-def corner():
-    spec = importlib.util.spec_from_file_location("blind_corner", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # A dataclass looks up its module.
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(__import__("sys").modules, "blind_corner", module)
-        spec.loader.exec_module(module)
-        yield module
-
-
-def test_distances_to_boxes_by_hand(corner):
+def test_distances_to_boxes_by_hand():
     boxes = np.array([[(0, 0, 0), (1, 2, 3)], [(5, 0, 0), (6, 1, 1)]], float)
     points = np.array([(-1, 1, 1), (2, 3, 1), (0.5, 1, 1), (4.5, 0.5, 0.5), (2, 3, 4)], float)
     expected = [1, np.sqrt(2), -0.5, 0.5, np.sqrt(3)]
     np.testing.assert_allclose(corner.exact_sdf(boxes, points), expected, atol=1e-12)
 
 
-def test_rays_end_at_the_first_surface(corner):
+def test_rays_end_at_the_first_surface():
     """Checked against sphere tracing, an independent caster."""
     scene = corner.draw_scene(0)
     origin = np.array([*scene.start, corner.SENSOR_HEIGHT])
@@ -45,7 +29,7 @@ def test_rays_end_at_the_first_surface(corner):
     np.testing.assert_allclose(ranges, traced, atol=1e-3)
 
 
-def test_scenes_hide_the_box_and_leave_a_path(corner):
+def test_scenes_hide_the_box_and_leave_a_path():
     for seed in range(100):
         scene = corner.draw_scene(seed)
         height = corner.SENSOR_HEIGHT
@@ -64,7 +48,7 @@ def test_scenes_hide_the_box_and_leave_a_path(corner):
         assert room >= 2 * (corner.ROBOT.radius + corner.ROBOT.margin) + 0.1
 
 
-def test_with_unseen_space_as_an_obstacle_the_robot_gets_around_the_corner(corner, monkeypatch):
+def test_with_unseen_space_as_an_obstacle_the_robot_gets_around_the_corner(monkeypatch):
     # The corridor fits into the exploring robot's map, whose update other tests compile too.
     (low, high), (inner_low, inner_high) = map_config().bounds, corner.map_config().bounds
     assert np.less_equal(low, inner_low).all() and np.less_equal(inner_high, high).all()

@@ -13,6 +13,7 @@ from hiosdf_jax._src.grid import carving, distance, evidence, frontier, lookup, 
 from hiosdf_jax._src.grid.evidence import EvidenceWindow
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.grid.windows import RayBox
+from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.state import Evidence, Grid
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
@@ -27,7 +28,11 @@ trace_rays = jax.jit(carving.trace_rays, static_argnums=0)
 fade_evidence = jax.jit(evidence.fade_evidence, static_argnums=0)
 update_distances = jax.jit(distance.update_distances, static_argnums=0)
 update_frontier = jax.jit(frontier.update_frontier, static_argnums=0)
-grid_sdf_and_grad = jax.jit(lookup.grid_sdf_and_grad, static_argnums=0)
+
+
+@jax.jit
+def grid_sdf_and_grad(surface, points):
+    return value_and_gradient(lambda each: lookup.grid_sdf(CONFIG, surface, each), points)
 
 
 def whole_window(stored):
@@ -97,7 +102,7 @@ def anywhere(sensor):
 def distance_at(surface, points):
     """The grid's distance and gradient at up to 2,000 points, by one compilation for all tests."""
     padded = np.resize(np.asarray(points, np.float32), (2000, 3))
-    value, gradient = grid_sdf_and_grad(CONFIG, surface, padded)
+    value, gradient = grid_sdf_and_grad(surface, padded)
     return np.asarray(value)[: len(points)], np.asarray(gradient)[: len(points)]
 
 

@@ -17,10 +17,9 @@ from tqdm import tqdm
 import hiosdf_jax as hio
 from benchmarks import records
 from benchmarks.accuracy.sources import Source
+from benchmarks.variants import VARIANTS
 from hiosdf_jax import datasets, scoring
-from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.state import Field, field_of
 
 # Forgetting compares the error in the region of the first frames, right after them and at the end.
@@ -81,10 +80,10 @@ def measure(
             if frame == last:
                 variant["scores"] = scores
             if frame == last and truth is not None:
-                ask = _asking(name, field)
-                variant["bands"] = scoring.evaluate_bands(ask, truth, pose[:3, 3], frame)
+                query = _query_of(name, field)
+                variant["bands"] = scoring.evaluate_bands(query, truth, pose[:3, 3], frame)
                 if name in early:
-                    first = scoring.evaluate(ask, truth, last_frame=EARLY_FRAMES - 1)
+                    first = scoring.evaluate(query, truth, last_frame=EARLY_FRAMES - 1)
                     scores["early_then_cm"] = early[name]
                     scores["early_now_cm"] = first["visible_cm"]
     return {
@@ -95,24 +94,12 @@ def measure(
         "frames": count,
         "config": dataclasses.asdict(config),
         "compile_and_first_update_ms": times_ms[0],
-        "update_ms": _spread(times_ms[1:]),
+        "update_ms": records.percentiles(times_ms[1:]),
         "variants": variants,
     } | records.provenance()
 
 
-def _grid_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return lookup.grid_sdf_and_grad(field.config, field.surface, points_world)
-
-
-# The map is an argument, so that each compiles once for all maps of one configuration.
-VARIANTS: dict[str, Callable[..., tuple[jax.Array, jax.Array]]] = {
-    "grid": jax.jit(_grid_sdf_and_grad),
-    "network": jax.jit(blend.network_sdf_and_grad),
-    "blended": hio.sdf_and_grad,  # compiled already
-}
-
-
-def _asking(name: str, field: Field) -> Callable[[np.ndarray], tuple[Any, Any]]:
+def _query_of(name: str, field: Field) -> Callable[[np.ndarray], tuple[Any, Any]]:
     return lambda points: VARIANTS[name](field, points)
 
 
@@ -120,7 +107,7 @@ def _score(
     name: str, field: Field, truth: scoring.GroundTruth, pose: np.ndarray, frame: int
 ) -> dict[str, float]:
     """Scores a map against the truth that was seen up to a frame."""
-    scores = scoring.evaluate(_asking(name, field), truth, pose[:3, 3], frame)
+    scores = scoring.evaluate(_query_of(name, field), truth, pose[:3, 3], frame)
     if name == "blended":
         scores |= scoring.evaluate_lower(CompiledQueries(field).lower, truth, frame)
     return scores
@@ -128,8 +115,8 @@ def _score(
 
 def _score_held_out(name: str, field: Field, points_world: np.ndarray) -> dict[str, float]:
     """Scores a map on returns of held-out frames, earlier and later, in observed space."""
-    ask, observed = _asking(name, field), CompiledQueries(field).observed
-    scores = scoring.score_held_out(lambda points: ask(points)[0], observed, points_world)
+    query, observed = _query_of(name, field), CompiledQueries(field).observed
+    scores = scoring.score_held_out(lambda points: query(points)[0], observed, points_world)
     return {key: value for key, value in scores.items() if key in scoring.METRICS}
 
 
@@ -141,10 +128,3 @@ def _returns_of(stream: datasets.Stream, frames: range, config: hio.Config) -> n
         cloud, pose = datasets.read_frame(stream, frame)
         parts.append(scoring.draw_returns(cloud, pose, config, len(frames), rng))
     return np.concatenate(parts)
-
-
-def _spread(values: list[float]) -> dict[str, float]:
-    if not values:
-        return {}
-    names = {"median": 50, "p10": 10, "p90": 90}
-    return {name: float(np.percentile(values, percent)) for name, percent in names.items()}

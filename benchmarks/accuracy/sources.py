@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from hiosdf_jax import datasets, scoring
 
-# The parts of a mesh tell which surface points are on thin things. The streams' truth does not.
+# The parts of a mesh show which surface points are thin. The streams' truth does not.
 _MESHES = {"house_depth": "small_house.ply", "house_lidar": "small_house.ply"}
 
 

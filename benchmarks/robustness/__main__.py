@@ -7,9 +7,9 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import jax
-
+from benchmarks import records
 from benchmarks.robustness import apartment, changes, faults, figures, gate, movers
 from benchmarks.robustness.library import Setup
 from benchmarks.robustness.measures import Figures
@@ -47,12 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     groups: dict[str, figures.Results] = {}
-    record = {
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
-        "seeds": options.seeds,
-        "rows": {},
-    }
+    record: dict[str, Any] = records.provenance() | {"seeds": options.seeds, "rows": {}}
     chosen = scenarios(options.data)
     for name in options.only or chosen:
         group = groups.setdefault(name, {})
@@ -62,8 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     group.setdefault(row, {}).setdefault(figure, []).append(value)
         print(figures.format_tables({name: group}) + "\n", flush=True)
         record["rows"] |= group
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(gate.format_json({options.config: record}), "utf-8")
+        records.write(options.output, {options.config: record})
     print(f"wrote {options.output}")
 
     rows = record["rows"]
@@ -80,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gate.update_baseline(options.baseline, options.config, record)
         print(f"wrote {options.baseline}")
         return int(options.bars and bool(missed))
-    old = gate.load_baseline(options.baseline).get(options.config, {"rows": {}})["rows"]
+    old = records.read(options.baseline).get(options.config, {"rows": {}})["rows"]
     verdict = gate.compare(old, rows)
     for heading, lines in (
         ("better than the baseline (--update-baseline takes it over)", verdict.better),

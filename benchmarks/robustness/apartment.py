@@ -140,7 +140,7 @@ def world_at(apartment: Apartment, number: int) -> World:
 
     Args:
         apartment: What stands still.
-        number: Of the scan.
+        number: Number of the scan.
 
     Returns:
         The person, if it is there, else something out of sight; then the chair; then the door.

@@ -1,4 +1,4 @@
-"""Faults injected into a clean stream: bursts after which the stream goes on, and steady faults."""
+"""Faults injected into a clean stream: steady faults, and bursts after which it continues."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Stream:
     """A clean stream and the truth about it.
 
     Attributes:
-        name: Of the stream.
+        name: Name of the stream.
         bounds: Two corners of the mapped box, m.
         max_range: m.
         frames: Its frames.
@@ -289,7 +289,7 @@ def _house(setup: Setup, path: Path) -> Stream:
     whole = datasets.NpzStream(path)
     stream = datasets.FrameStream("house_depth", _HOUSE_FRAMES, whole.__getitem__)
     extent = datasets.find_bounds(stream)
-    truth = datasets.ground_truth(path)
+    truth = datasets.read_truth(path)
     assert truth is not None
     seen = truth.frame < _HOUSE_FRAMES
     frames = []

@@ -7,13 +7,12 @@ a share.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks import records
 from benchmarks.robustness.figures import FIGURES, Results
 
 BASELINE = Path(__file__).parents[1] / "results" / "robustness_baseline.json"
@@ -37,24 +36,24 @@ class Verdict(NamedTuple):
     compared: int
 
 
-def load_baseline(path: Path) -> dict[str, Any]:
-    """Reads {configuration: {"device", "jax", "seeds", "rows"}}; empty if there is no file."""
-    return json.loads(path.read_text("utf-8")) if path.is_file() else {}
-
-
 def update_baseline(path: Path, config_name: str, record: dict[str, Any]) -> None:
     """Writes a run into a baseline; rows that were not run stay.
 
     Args:
         path: The file.
-        config_name: Of the run.
-        record: {"device", "jax", "seeds", "rows"}.
+        config_name: Name of the configuration.
+        record: {"device", "jax", "revision", "seeds", "rows"}.
     """
-    baseline = load_baseline(path)
-    rows = baseline.get(config_name, {}).get("rows", {}) | record["rows"]
+    baseline = records.read(path)
+    measured = {
+        row: {
+            name: [records.rounded(value, 4) for value in values] for name, values in each.items()
+        }
+        for row, each in record["rows"].items()
+    }
+    rows = baseline.get(config_name, {}).get("rows", {}) | measured
     baseline[config_name] = record | {"rows": rows}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(format_json(baseline), "utf-8")
+    records.write(path, baseline)
 
 
 def compare(old: Results, new: Results) -> Verdict:
@@ -69,9 +68,10 @@ def compare(old: Results, new: Results) -> Verdict:
     """
     verdict = Verdict([], [], 0)
     for row, figures in new.items():
-        for name, before in old.get(row, {}).items():
+        for name, recorded in old.get(row, {}).items():
             verdict = verdict._replace(compared=verdict.compared + 1)
-            after = figures.get(name, [np.nan])
+            before = np.array(recorded, float)  # a record has null for NaN
+            after = np.array(figures.get(name, [np.nan]))
             change = _worsening(name, before, after)
             line = f"{row}: {name} {np.mean(before):.3g} -> {np.mean(after):.3g}"
             if not change <= _tolerance(name, before, after):  # also catches NaN
@@ -81,31 +81,7 @@ def compare(old: Results, new: Results) -> Verdict:
     return verdict
 
 
-def format_json(record: dict[str, Any]) -> str:
-    """A record as JSON with one line per row, and four digits."""
-
-    def rounded(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: rounded(each) for key, each in value.items()}
-        if isinstance(value, list):
-            return [rounded(each) for each in value]
-        return float(f"{value:.4g}") if isinstance(value, float) else value
-
-    lines = ["{"]
-    for number, (config_name, entry) in enumerate(record.items()):
-        lines.append(f" {json.dumps(config_name)}: {{")
-        facts = {key: value for key, value in entry.items() if key != "rows"}
-        lines += [f"  {json.dumps(key)}: {json.dumps(value)}," for key, value in facts.items()]
-        rows = [
-            f"   {json.dumps(row)}: {json.dumps(rounded(figures))}"
-            for row, figures in entry["rows"].items()
-        ]
-        lines += ['  "rows": {', ",\n".join(rows), "  }"]
-        lines.append(" }" if number == len(record) - 1 else " },")
-    return "\n".join([*lines, "}"]) + "\n"
-
-
-def _worsening(name: str, old: Sequence[float], new: Sequence[float]) -> float:
+def _worsening(name: str, old: np.ndarray, new: np.ndarray) -> float:
     before, after = float(np.mean(old)), float(np.mean(new))
     better = FIGURES[name].better
     if better == "higher":
@@ -113,7 +89,7 @@ def _worsening(name: str, old: Sequence[float], new: Sequence[float]) -> float:
     return abs(after) - abs(before) if better == "nearer 0" else after - before
 
 
-def _tolerance(name: str, old: Sequence[float], new: Sequence[float]) -> float:
+def _tolerance(name: str, old: np.ndarray, new: np.ndarray) -> float:
     freedom = len(old) + len(new) - 2
     squares = sum(float(np.var(side)) * len(side) for side in (old, new))
     spread = np.sqrt(squares / freedom) if freedom else 0.0

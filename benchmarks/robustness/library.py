@@ -112,7 +112,7 @@ def play(
     """
     flags, refused = [], []
     for index, frame in enumerate(tqdm(frames, desc=name, unit="update", leave=False)):
-        # Sticky flags are cleared before each update, so that each tells of itself.
+        # Sticky flags are cleared before each update, so that each shows only its own flags.
         report = state.report.replace(flags=jnp.zeros_like(state.report.flags))
         extras: dict[str, Any] = {
             key: value
@@ -173,12 +173,12 @@ def is_finite(state: hio.MapState) -> bool:
     return all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
 
 
-def _in_chunks(ask: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
+def _in_chunks(query: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
     points = np.asarray(points, np.float32)
     answers = np.empty(len(points))
     for start in range(0, len(points), _CHUNK):
         chunk = points[start : start + _CHUNK]
         padded = np.zeros((_CHUNK, 3), np.float32)
         padded[: len(chunk)] = chunk
-        answers[start : start + _CHUNK] = np.asarray(ask(padded))[: len(chunk)]
+        answers[start : start + _CHUNK] = np.asarray(query(padded))[: len(chunk)]
     return answers

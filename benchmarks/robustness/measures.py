@@ -46,10 +46,10 @@ def solidity(state: hio.MapState, thing: Thing, rng: np.random.Generator) -> Fig
 
     Returns:
         `solid` and `solid_lower`, the shares of its inside deeper than 5 cm with sdf < 0 under
-        unknown="obstacle" and with lower < 0; `outward`, the share of waypoints in it with sdf < 0
-        from which it is at most 40 cm along the gradient to the outside; `pushed_out`, the share
-        that reach it when they follow the gradient until they are 5 cm clear. The outside begins
-        2 cm below the surface.
+        unknown="obstacle" and with lower < 0. `outward`, the share of waypoints in it with sdf < 0
+        that reach the outside within 40 cm along the gradient. `pushed_out`, the share of waypoints
+        that are outside after they follow the gradient until they are 5 cm clear. The outside
+        begins 2 cm below the surface.
     """
     inside = draw_inside(thing, _INSIDE_POINTS, DEEP, rng)
     waypoints = draw_inside(thing, 2 * _WAYPOINTS, DEEP, rng)
@@ -304,8 +304,7 @@ def ghosts(
 
 
 def kept(state: hio.MapState, scans: Sequence[Scan], things: Sequence[int]) -> Figures:
-    """Scores whether surfaces are in the map: `kept`, the share of what scans saw of some things
-    with sdf <= 2 cm.
+    """Scores whether the surfaces of things are in the map.
 
     Args:
         state: The map.
@@ -313,14 +312,14 @@ def kept(state: hio.MapState, scans: Sequence[Scan], things: Sequence[int]) -> F
         things: Indices of the things in the world.
 
     Returns:
-        The figure.
+        `kept`, the share of the surface that scans saw with sdf <= 2 cm.
     """
     points = np.concatenate([each.exact_world[np.isin(each.hit, things)] for each in scans])
     return {"kept": float(np.mean(library.sdf(state, points) <= _KEPT))}
 
 
 class RowCounts:
-    """Counts how well the rows of moving things are told apart."""
+    """Counts how well the rows of moving things are recognized."""
 
     def __init__(self) -> None:
         """Starts with no rows."""

@@ -66,7 +66,7 @@ def arm_at(number: int, pose: np.ndarray) -> tuple[Capsule, Capsule]:
     """The arm of the robot that carries the camera, with its hand 30 to 55 cm in front.
 
     Args:
-        number: Of the scan.
+        number: Number of the scan.
         pose: (4, 4) T_world_camera.
 
     Returns:

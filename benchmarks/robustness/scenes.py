@@ -41,7 +41,7 @@ def facing_path(sensor: Sensor, number: int) -> np.ndarray:
 
     Args:
         sensor: The sensor.
-        number: Of the scan.
+        number: Number of the scan.
 
     Returns:
         (4, 4) T_world_sensor.
@@ -57,7 +57,7 @@ def touring_path(sensor: Sensor, number: int) -> np.ndarray:
 
     Args:
         sensor: The sensor.
-        number: Of the scan, of `TOUR`.
+        number: Number of the scan, less than `TOUR`.
 
     Returns:
         (4, 4) T_world_sensor.
@@ -81,8 +81,8 @@ def scan_all(
         setup: Source of randomness.
         sensor: The sensor.
         world_at: The world at each scan.
-        numbers: Of the scans.
-        path: Of the sensor.
+        numbers: Numbers of the scans.
+        path: Pose of the sensor at each scan.
 
     Returns:
         The scans.

@@ -125,8 +125,8 @@ def training_work(config: Config) -> Work:
     """Counts the work of an update's training.
 
     A sample with a slope takes 6 products per layer and epoch: the value, the gradient by the
-    point, and two for the backward pass of each. A sample without a slope takes 3. The residuals at
-    the end take 1.
+    point, and two for the reverse-mode evaluation of each. A sample without a slope takes 3. The
+    residuals at the end take 1.
     """
     samples = config.near_samples + config.far_samples
     samples += config.local_points * config.local_ray_samples

@@ -11,13 +11,11 @@ import jax.numpy as jnp
 import hiosdf_jax as hio
 from benchmarks.speed import baselines, limits
 from benchmarks.speed.rows import Measured, time_ms
+from benchmarks.variants import VARIANTS
 from hiosdf_jax._src.config import Bounds
-from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.network import training
 from hiosdf_jax._src.samples.draw import Samples
 from hiosdf_jax._src.state import field_of
-
-ask_network = jax.jit(blend.network_sdf_and_grad)
 
 
 def train(label: str, config: hio.Config, machine: limits.Limits, seconds: float) -> Measured:
@@ -66,7 +64,7 @@ def train_paper(
     return Measured(rows, beside)
 
 
-def ask_paper(bounds: Bounds, count: int, machine: limits.Limits, seconds: float) -> Measured:
+def query_paper(bounds: Bounds, count: int, machine: limits.Limits, seconds: float) -> Measured:
     """Times distances and gradients of the paper's network alone; its weights do not matter.
 
     Args:
@@ -81,7 +79,7 @@ def ask_paper(bounds: Bounds, count: int, machine: limits.Limits, seconds: float
     config = hio.Config.paper(bounds)
     state = hio.init(config, jax.random.key(0))
     points = points_in(config, count)
-    spread = time_ms(ask_network, field_of(state), points, seconds=seconds)
+    spread = time_ms(VARIANTS["network"], field_of(state), points, seconds=seconds)
     relative = points - state.network.origin_world
     beside = baselines.network_query(config, state.network, relative, seconds)
     work = limits.network_query_work(config, count)

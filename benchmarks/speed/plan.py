@@ -63,9 +63,11 @@ def plan(setup: Setup) -> dict[str, Task]:
     tasks["training, the paper's"] = lambda: networks.train_paper(
         bounds, sizes.paper_overrides, machine(), seconds
     )
-    tasks["network queries"] = lambda: networks.ask_paper(bounds, sizes.queries, machine(), seconds)
-    asked = "default" if "default" in sizes.configs else last
-    tasks["queries"] = lambda: queries.ask_map(asked, state(asked), machine(), sizes)
+    tasks["network queries"] = lambda: networks.query_paper(
+        bounds, sizes.queries, machine(), seconds
+    )
+    queried = "default" if "default" in sizes.configs else last
+    tasks["queries"] = lambda: queries.query_map(queried, state(queried), machine(), sizes)
     tasks["compiling by sizes"] = lambda: scaling.compile_updates(setup, last)
     tasks["donated updates"] = lambda: updates.donated_updates(setup, last)
     tasks["cloud sizes"] = lambda: scaling.cloud_sizes(setup)

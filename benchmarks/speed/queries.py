@@ -1,21 +1,19 @@
-"""Task that times distances and gradients by each way of asking a map."""
+"""Task that times distances and gradients by each variant of a map."""
 
 from __future__ import annotations
 
 import functools
 
-import jax
-
 import hiosdf_jax as hio
 from benchmarks.speed import limits
-from benchmarks.speed.networks import ask_network, points_in
+from benchmarks.speed.networks import points_in
 from benchmarks.speed.rows import Measured, Row, Spread, time_ms
 from benchmarks.speed.setup import Sizes
-from hiosdf_jax._src.grid import lookup
-from hiosdf_jax._src.state import Field, MapState
+from benchmarks.variants import VARIANTS
+from hiosdf_jax._src.state import MapState
 
 
-def ask_map(label: str, state: MapState, machine: limits.Limits, sizes: Sizes) -> Measured:
+def query_map(label: str, state: MapState, machine: limits.Limits, sizes: Sizes) -> Measured:
     """Times the network alone, both blended, the grid alone, and a baked field.
 
     Args:
@@ -37,9 +35,9 @@ def ask_map(label: str, state: MapState, machine: limits.Limits, sizes: Sizes) -
     points = points_in(config, sizes.queries)
     work = limits.network_query_work(config, sizes.queries)
     time = functools.partial(time_ms, seconds=sizes.seconds)
-    add("network", sizes.queries, time(ask_network, field, points), work)
-    add("blended", sizes.queries, time(hio.sdf_and_grad, field, points))
-    add("grid", sizes.queries, time(_ask_grid, field, points))
+    add("network", sizes.queries, time(VARIANTS["network"], field, points), work)
+    add("blended", sizes.queries, time(VARIANTS["blended"], field, points))
+    add("grid", sizes.queries, time(VARIANTS["grid"], field, points))
     bake = functools.partial(hio.bake, resolution=sizes.bake_resolution)
     baking = time(bake, field)
     baked = bake(field)
@@ -47,8 +45,3 @@ def ask_map(label: str, state: MapState, machine: limits.Limits, sizes: Sizes) -
         add("baked", count, time(hio.sdf_and_grad, baked, points_in(config, count)))
     samples = f"{baked.sdf.size:,} samples of {sizes.bake_resolution} m"
     return Measured([*rows, Row(f"bake, {label}", "ms", baking, note=samples)])
-
-
-@jax.jit
-def _ask_grid(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return lookup.grid_sdf_and_grad(field.config, field.surface, points_world)

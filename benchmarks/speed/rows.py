@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from benchmarks import records
 from hiosdf_jax.scoring import lay_out
@@ -81,9 +80,8 @@ OUT_OF_TIME = "not run: --minutes are over"
 
 def spread_of(values: Iterable[float]) -> Spread:
     """Computes the percentiles of at least one measurement."""
-    array = np.asarray(list(values), float)
-    median, p10, p90, p99 = (float(x) for x in np.percentile(array, (50, 10, 90, 99)))
-    return Spread(median, p10, p90, p99, len(array))
+    measured = list(values)
+    return Spread(**records.percentiles(measured, (50, 10, 90, 99)), count=len(measured))
 
 
 def single(value: float) -> Spread:

@@ -17,8 +17,8 @@ Frame = tuple[np.ndarray, np.ndarray]  # cloud (N, 3) m in the sensor frame, T_w
 
 _MAX_FRAMES = 200
 
-# {label: preset and changes of its fields}, the least memory first: of the peaks, only the first is
-# certainly that of its configuration.
+# {label: preset and changes of its fields}. The one that needs the least memory comes first,
+# because only the first peak is certainly that of its configuration.
 CONFIGS: dict[str, tuple[str, dict[str, Any]]] = {
     "light": ("light", {}),
     "default": ("default", {}),

@@ -111,7 +111,7 @@ def time_parts(
 
 
 def _changes(stage: Callable[[Step], Step], step: Step) -> Step:
-    """Runs a stage without what it passes through: jit would copy the whole map."""
+    """Runs a stage without what it leaves unchanged: jit would copy the whole map."""
     given = dict(jax.tree.leaves_with_path(step))
     return jax.tree.map_with_path(
         lambda path, leaf: None if given.get(path) is leaf else leaf, stage(step)

@@ -98,7 +98,7 @@ def slopes() -> str:
         metrics = ("visible_cm", "visible_cm", "median_cm", "median_cm")
         rows.append([label, *map(_score, means, metrics)])
     columns = [f"house, {sensor}" for sensor in _HOUSE.values()] + list(_REAL.values())
-    return lay_out(["slopes of", *columns], rows)
+    return lay_out(["Eikonal loss on", *columns], rows)
 
 
 TABLES = {

@@ -1,4 +1,4 @@
-"""The table of the committed records: what each is measured on, and at which revision."""
+"""The table of the committed records: what each is measured on."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from benchmarks.tables.markdown import lay_out
 
 
 def provenance() -> str:
-    """Devices, versions of jax and revisions of this repository, by record."""
+    """Devices and versions of jax, by record."""
     cells = []
     for path in sorted(records.RESULTS.glob("*.json")):
         entries = list(_entries(records.read(path)))
         cells.append(
             [f"`{path.name}`", *(_together(entry[key] for entry in entries) for key in _KEYS)]
         )
-    return lay_out(["record", "device", "jax", "revision"], cells)
+    return lay_out(["record", "device", "jax"], cells)
 
 
 TABLES = {"records": provenance}
 
-_KEYS = ("device", "jax", "revision")
+_KEYS = ("device", "jax")
 
 
 def _together(values: Iterable[str]) -> str:

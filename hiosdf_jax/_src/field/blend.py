@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Bounds, Config
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.network import siren
-from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.state import Field
 
 # The grid's answer fades out between these shares of its horizon.
@@ -101,19 +100,6 @@ def network_sdf(field: Field, points_world: jax.Array) -> jax.Array:
         (...) m.
     """
     return siren.predict(field.config, field.params, points_world - field.origin_world)
-
-
-def network_sdf_and_grad(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Computes the signed distance of the network alone, and its gradient.
-
-    Args:
-        field: The field.
-        points_world: (..., 3) m, inside the bounds.
-
-    Returns:
-        The distance (...) m and its gradient (..., 3).
-    """
-    return value_and_gradient(lambda points: network_sdf(field, points), points_world)
 
 
 def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:

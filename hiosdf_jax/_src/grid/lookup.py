@@ -13,7 +13,6 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, split, take
 from hiosdf_jax._src.state import NO_FEATURE, Surface, frontier_step_m
 
@@ -93,22 +92,6 @@ def grid_sdf(config: Config, surface: Surface, points_world: jax.Array) -> jax.A
         (...) m; the horizon where no patch is within it. Differentiable by the points.
     """
     return nearest_patch(config, surface, points_world).sdf
-
-
-def grid_sdf_and_grad(
-    config: Config, surface: Surface, points_world: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Computes the signed distance of the grid alone, and its gradient.
-
-    Args:
-        config: The map's configuration.
-        surface: The grid's surface.
-        points_world: (..., 3) m.
-
-    Returns:
-        The distance (...) m and its gradient (..., 3).
-    """
-    return value_and_gradient(lambda points: grid_sdf(config, surface, points), points_world)
 
 
 def doubt_distance(config: Config, surface: Surface, points_world: jax.Array) -> jax.Array:
