@@ -47,7 +47,7 @@ def bake(
     if not isinstance(field, Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
     if (center is None) != (size is None):
-        raise ValueError("center and size define a window: expected both of them or neither")
+        raise ValueError("center and size define a window, expected both or neither")
     if size is None:
         low, high = np.asarray(field.config.bounds)
         size, corner_world = high - low, jnp.asarray(low, jnp.float32)
