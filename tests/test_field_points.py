@@ -1,5 +1,7 @@
 """Queries: defined everywhere, differentiable, equal for one point and for many."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,16 @@ from room import BOUNDS, CONFIG
 
 import hiosdf_jax as hio
 
+# A network of two layers: its derivatives go through more than one sine.
+DEEP = dataclasses.replace(CONFIG, hidden_width=32, hidden_layers=2)
+
 CORNER = np.array(BOUNDS[1], np.float32)
 
 
 @pytest.fixture(scope="module")
 def field():
     """Without updates it is smooth: the network answers alone."""
-    return hio.snapshot(hio.init(CONFIG, jax.random.key(3)))
+    return hio.snapshot(hio.init(DEEP, jax.random.key(3)))
 
 
 def points_around(count, spread=4.0):
@@ -44,6 +49,9 @@ def test_a_large_batch_equals_small_ones_at_sizes_that_xla_has_miscompiled(field
     together = hio.sdf_and_grad(field, points)
     np.testing.assert_allclose(together[0], value, atol=1e-5)
     np.testing.assert_allclose(together[1], gradient, atol=1e-4)
+    inside = jax.jit(lambda field, points: hio.sdf_and_grad(field, points))(field, points)
+    np.testing.assert_allclose(inside[0], value, atol=1e-5)
+    np.testing.assert_allclose(inside[1], gradient, atol=1e-4)
     values = jax.jit(jax.vmap(lambda p: hio.sdf(field, p)))(points)
     np.testing.assert_allclose(values, value, atol=1e-5)
 

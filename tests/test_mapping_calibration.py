@@ -20,7 +20,7 @@ def field(room_map):
 
 
 def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypatch):
-    points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (2000, 3)), jnp.float32)
+    points = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 3)), jnp.float32)
     seen = np.asarray(hio.query(field, points).observed)
 
     def known(_, points):
@@ -47,13 +47,13 @@ def test_calibration_follows_the_quantile_of_the_newest_returns(field, monkeypat
 
     calibrate = compiled_calibrate()
 
-    every = np.ones(2000, bool)
+    every = np.ones(5000, bool)
     assert abs(calibrate(field, every) - expected) < 0.02
     later = field.replace(updates=jnp.int32(1000))
     assert abs(calibrate(later, every) - (0.98 * 9 + 0.02 * expected)) < 0.01
     assert calibrate(field, ~seen) == 9
-    assert calibrate(field, np.zeros(2000, bool)) == 9
-    few = seen & (np.cumsum(seen) <= 1)  # drawn 2,000 times, which is enough
+    assert calibrate(field, np.zeros(5000, bool)) == 9
+    few = seen & (np.cumsum(seen) <= 1)  # drawn 5,000 times, which is enough
     assert calibrate(field, few) != 9
     offset = -1.0  # the map agrees with all returns, and free space still needs some margin
     assert compiled_calibrate()(field, every) == pytest.approx(calibration._LEAST)

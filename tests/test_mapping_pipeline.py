@@ -90,41 +90,6 @@ def test_one_compilation_for_clouds_of_any_size(empty_map, room_map):
     assert int(state.report.points_used) == 300
 
 
-def test_scan_and_vmap_inside_jit_equal_the_eager_loop(empty_map, room_map):
-    """Two maps at once, each from its own stream, and queried in the same compiled function."""
-
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, 0, 0, None))
-    def map_and_query(state, clouds, poses, points):
-        last, reports = jax.lax.scan(
-            lambda state, frame: (hio.update(state, *frame), state.report), state, (clouds, poses)
-        )
-        return last, reports, hio.sdf_and_grad(last, points)
-
-    other = hio.init(CONFIG, jax.random.key(1))
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), empty_map, other)
-    streams = stream(), stream()[::-1]
-    clouds, poses = (
-        jnp.stack([jnp.stack(part) for part in parts])
-        for parts in zip(*(zip(*frames, strict=True) for frames in streams), strict=True)
-    )
-    points = jnp.zeros((5, 3))
-    together, reports, (values, gradients) = map_and_query(both, clouds, poses, points)
-    assert reports.points_used.shape == (2, 4)
-    for frame in streams[1]:
-        other = hio.update(other, *frame)
-    for k, alone in enumerate((room_map, other)):
-        part = jax.tree.map(lambda leaf, k=k: leaf[k], together)
-        # The cloud is not padded inside jit (250 rows, not 300): the result must not depend on it.
-        assert arrays_equal(part.grid.evidence.hits, alone.grid.evidence.hits)
-        assert arrays_equal(part.grid.evidence.passes, alone.grid.evidence.passes)
-        assert closeness(part, alone) < 1e-5
-        assert int(part.updates) == 4
-        expected = hio.sdf_and_grad(alone, points)
-        np.testing.assert_allclose(values[k], expected[0], atol=1e-5)
-        np.testing.assert_allclose(gradients[k], expected[1], atol=1e-4)
-
-
 def test_invalid_rows_change_nothing(empty_map):
     cloud, pose = stream(1)[0]
     rows = np.full((300, 3), np.nan, np.float32)
@@ -156,26 +121,6 @@ def test_bad_input_raises_and_names_the_argument(room_map, cloud, pose, message)
     with pytest.raises(ValueError, match=message):
         hio.update(room_map, cloud, pose)
     assert arrays_equal(before, room_map)
-
-
-@pytest.mark.parametrize(
-    "row, pose, flag",
-    [
-        (np.nan, np.eye(4), hio.Flag.EMPTY_CLOUD),
-        (1.0, np.full((4, 4), np.nan), hio.Flag.BAD_POSE),
-        (1.0, np.diag([2.0, 2, 2, 1]), hio.Flag.BAD_POSE),
-        (np.nan, np.diag([2.0, 2, 2, 1]), hio.Flag.BAD_POSE | hio.Flag.EMPTY_CLOUD),
-    ],
-)
-def test_bad_input_inside_jit_only_raises_a_sticky_flag(room_map, row, pose, flag):
-    # The compiled function of `update`, which has no checks on the host.
-    cloud = np.full((CONFIG.max_points, 3), row, np.float32)
-    after = pipeline._update_jit(room_map, cloud, pose.astype(np.float32))
-    assert hio.Flag(int(after.report.flags)) == flag
-    flags = room_map.report.flags
-    assert arrays_equal(after.replace(report=after.report.replace(flags=flags)), room_map)
-    later = hio.update(after, *stream(1)[0])
-    assert hio.Flag(int(later.report.flags)) == flag
 
 
 def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty_map):
@@ -290,15 +235,6 @@ def test_a_cloud_out_of_range_still_trains_on_the_grid(room_map):
     index, _, _ = geometry.voxel_of(CONFIG, jnp.asarray([[0.3, 0.3, 0.3]]))
     at = tuple(np.asarray(index)[0])
     assert float(far.grid.evidence.passes[at]) > float(room_map.grid.evidence.passes[at])
-
-
-def test_an_empty_cloud_inside_jit_is_flagged():
-    # Short horizons: little to compile.
-    tiny = dataclasses.replace(CONFIG, distance_horizon=0.1, frontier_horizon=0.1)
-    state = hio.init(tiny, jax.random.key(0))
-    after = jax.jit(hio.update)(state, jnp.zeros((0, 3)), jnp.eye(4))
-    assert int(after.report.flags) & hio.Flag.EMPTY_CLOUD
-    assert arrays_equal(after.grid, state.grid)
 
 
 def test_a_fresh_state_can_be_donated():

@@ -148,9 +148,10 @@ def test_swept_clearance_under_vmap_and_its_gradient(scene, field):
     starts, radii = spheres(COUNT, margin=-0.05)
     way = np.float32([0.31, -0.17, 0.12])
     arguments = [starts, starts + way, radii]
-    mapped = jax.jit(jax.vmap(swept_clearance, (None, 0, 0, 0)))(scene, *arguments)
-    np.testing.assert_allclose(mapped, SWEPT(scene, *arguments), atol=1e-5)
+    mapped = jax.jit(jax.vmap(swept_clearance, (None, 0, 0, 0)))
     for answering in (scene, field):
+        expected = SWEPT(answering, *arguments)
+        np.testing.assert_allclose(mapped(answering, *arguments), expected, atol=1e-5)
         gradients = SLOPES(answering, *arguments)
         step = 5e-4
         for argument, axis in ((0, 0), (1, 2)):

@@ -12,7 +12,7 @@ from scene import ROOM, exact_sdf
 
 from hiosdf_jax import planning
 
-ROVER = (example.ROVER, 256, example.HORIZON)
+ROVER = (example.ROVER, 1024, example.HORIZON)
 ARM = (example.ARM, 16, 4)  # its steps take ten times as long
 BOX = (ROOM[0] - 0.2, ROOM[1] + 0.2, 0.1)  # corners and resolution of all maps, m
 

@@ -1,0 +1,94 @@
+"""An update inside the user's own jit, scan, vmap and donation, each compiled by itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import BOUNDS, CONFIG, arrays_equal, stream
+
+import hiosdf_jax as hio
+
+
+def closeness(a, b):
+    """Largest difference between two maps' answers, m."""
+    points = np.random.default_rng(0).uniform(BOUNDS[0], BOUNDS[1], (500, 3)).astype(np.float32)
+    return float(jnp.max(jnp.abs(hio.sdf(a, points) - hio.sdf(b, points))))
+
+
+def test_scan_and_user_jit_equal_the_eager_loop(empty_map, room_map):
+    clouds, poses = (jnp.stack(part) for part in zip(*stream(), strict=True))
+
+    @jax.jit
+    def scanned(state, clouds, poses):
+        return jax.lax.scan(lambda s, x: (hio.update(s, *x), s.report), state, (clouds, poses))
+
+    last, reports = scanned(empty_map, clouds, poses)
+    # The cloud is not padded inside jit (250 rows, not 300): the result must not depend on that.
+    assert arrays_equal(last.grid.evidence.hits, room_map.grid.evidence.hits)
+    assert closeness(last, room_map) < 1e-5
+    assert int(last.updates) == 4
+    assert reports.points_used.shape == (4,)
+
+    @jax.jit
+    def planner(state, cloud, pose, points):
+        return hio.sdf_and_grad(hio.update(state, cloud, pose), points)
+
+    cloud, pose = stream(1)[0]
+    points = jnp.zeros((5, 3))
+    value, gradient = planner(empty_map, cloud, pose, points)
+    expected = hio.sdf_and_grad(hio.update(empty_map, cloud, pose), points)
+    np.testing.assert_allclose(value, expected[0], atol=1e-5)
+    np.testing.assert_allclose(gradient, expected[1], atol=1e-4)
+
+
+def test_vmap_over_two_maps_equals_each(empty_map):
+    other = hio.init(CONFIG, jax.random.key(1))
+    frames = stream(2)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), empty_map, other)
+    clouds, poses = (jnp.stack(part) for part in zip(*frames, strict=True))
+    together = jax.jit(jax.vmap(hio.update))(both, clouds, poses)
+    for k, state in enumerate((empty_map, other)):
+        alone = hio.update(state, *frames[k])
+        part = jax.tree.map(lambda leaf, k=k: leaf[k], together)
+        assert arrays_equal(part.grid.evidence.hits, alone.grid.evidence.hits)
+        assert arrays_equal(part.grid.evidence.passes, alone.grid.evidence.passes)
+        assert closeness(part, alone) < 1e-4
+
+
+@pytest.mark.parametrize(
+    "cloud, pose, flag",
+    [
+        (np.full((5, 3), np.nan), np.eye(4), hio.Flag.EMPTY_CLOUD),
+        (np.ones((5, 3)), np.full((4, 4), np.nan), hio.Flag.BAD_POSE),
+        (np.ones((5, 3)), np.diag([2.0, 2, 2, 1]), hio.Flag.BAD_POSE),
+        (
+            np.full((5, 3), np.nan),
+            np.diag([2.0, 2, 2, 1]),
+            hio.Flag.BAD_POSE | hio.Flag.EMPTY_CLOUD,
+        ),
+    ],
+)
+def test_bad_input_inside_jit_only_raises_a_sticky_flag(room_map, cloud, pose, flag):
+    after = jax.jit(hio.update)(room_map, jnp.asarray(cloud), jnp.asarray(pose))
+    assert hio.Flag(int(after.report.flags)) == flag
+    flags = room_map.report.flags
+    assert arrays_equal(after.replace(report=after.report.replace(flags=flags)), room_map)
+    later = hio.update(after, *stream(1)[0])
+    assert hio.Flag(int(later.report.flags)) == flag
+
+
+def test_snapshot_is_independent_of_a_donated_map(empty_map):
+    state = hio.update(empty_map, *stream(1)[0])
+    field = hio.snapshot(state)
+    points = np.zeros((3, 3))
+    before = hio.query(field, points)
+    assert arrays_equal(before, hio.query(state, points))
+    jax.jit(hio.update, donate_argnums=0)(state, *(jnp.asarray(x) for x in stream(1)[0]))
+    assert arrays_equal(hio.query(field, points), before)
+    assert int(field.updates) == 1
+
+
+def test_an_empty_cloud_inside_jit_is_flagged(room_map):
+    after = jax.jit(hio.update)(room_map, jnp.zeros((0, 3)), jnp.eye(4))
+    assert int(after.report.flags) & hio.Flag.EMPTY_CLOUD
+    assert arrays_equal(after.grid, room_map.grid)
