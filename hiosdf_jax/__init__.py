@@ -7,6 +7,8 @@ from hiosdf_jax._src.field.mesh import extract_mesh
 from hiosdf_jax._src.field.points import query, sdf, sdf_and_grad
 from hiosdf_jax._src.mapping.background import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
+from hiosdf_jax._src.mapping.forgetting import forget
+from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, snapshot, update
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 
@@ -21,9 +23,11 @@ __all__ = [
     "Report",
     "bake",
     "extract_mesh",
+    "forget",
     "grow",
     "init",
     "load",
+    "moving_rows",
     "planning",
     "query",
     "save",

@@ -172,6 +172,11 @@ def test_unseen_space_is_an_obstacle_on_request(room_map):
     points = np.random.default_rng(2).uniform(-1.4, 1.4, (2000, 3)).astype(np.float32)
     plain, solid = hio.query(room_map, points), hio.query(room_map, points, unknown="obstacle")
     expected = np.minimum(plain.sdf, plain.frontier)
+    # From 0 to 40 cm deep in unseen space the frontier takes over: its gradient leads out.
+    frontier = np.asarray(plain.frontier, np.float64)
+    deep = np.clip(-frontier / 0.4, 0, 1)
+    assert min(np.mean(deep == 0), np.mean((deep > 0) & (deep < 1)), np.mean(deep == 1)) > 0.05
+    expected = (1 - deep) * expected + deep * frontier
     np.testing.assert_allclose(solid.sdf, expected, atol=1e-6)
     assert (np.asarray(solid.sdf)[~np.asarray(solid.observed)] <= 0).all()
     assert 0.2 < np.mean(np.asarray(plain.sdf) > plain.frontier) < 0.98
@@ -189,6 +194,35 @@ def test_unseen_space_is_an_obstacle_on_request(room_map):
         slope = np.asarray(high - low) / (2 * step)
         agrees = np.abs(slope - np.asarray(solid.grad)[:, axis]) < 0.02
         assert agrees[unseen_nearer].mean() > 0.95  # not at faces of cells
+        assert agrees[deep == 1].mean() > 0.95
+
+
+def test_deep_in_unseen_space_only_the_frontier_counts(room_map):
+    """Another network changes the answer in observed space, and none deep in unseen space."""
+    points = np.random.default_rng(2).uniform(-1.4, 1.4, (2000, 3)).astype(np.float32)
+    other = room_map.replace(network=hio.init(CONFIG, jax.random.key(9)).network)
+    mine, others = (hio.query(state, points, unknown="obstacle") for state in (room_map, other))
+    deep = np.asarray(mine.frontier) <= -0.4
+    assert deep.mean() > 0.1
+    np.testing.assert_allclose(mine.sdf[deep], mine.frontier[deep], atol=1e-6)
+    np.testing.assert_array_equal(others.sdf[deep], mine.sdf[deep])
+    np.testing.assert_allclose(others.grad[deep], mine.grad[deep], atol=1e-6)
+    assert np.abs(np.asarray(others.sdf) - mine.sdf)[~deep].max() > 0.01
+
+
+def test_the_lower_bound_of_unseen_space_is_at_most_the_frontier(room_map):
+    points = np.random.default_rng(3).uniform(-1.4, 1.4, (2000, 3)).astype(np.float32)
+    answer = hio.query(room_map, points)
+    unseen = ~np.asarray(answer.observed)
+    assert 0.2 < unseen.mean() < 0.9
+    lower, frontier = np.asarray(answer.lower), np.asarray(answer.frontier)
+    assert (lower[unseen] <= frontier[unseen] + 1e-6).all()
+    assert (lower[unseen] < 0).all()
+    # A map that trusts itself blindly is bounded by the frontier alone, but only there.
+    trusting = room_map.replace(optimism=jnp.float32(-100))
+    blind = np.asarray(hio.query(trusting, points).lower)
+    np.testing.assert_allclose(blind[unseen], frontier[unseen], atol=1e-6)
+    assert (blind[~unseen] > frontier[~unseen]).all()
 
 
 def test_another_policy_is_refused_by_name(room_map):

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from voxels import CONFIG, SHAPE, empty_window, rays_to, trace, uniform
@@ -49,3 +50,13 @@ def test_a_long_ray_does_not_depend_on_the_steps_per_iteration(monkeypatch):
         np.testing.assert_array_equal(compiled_anew().passes, once.passes)
     longest = np.sum(np.asarray(rays.free_ranges) / 0.02 - 1)
     assert abs(float(once.passes.sum()) - longest) < len(ends)
+
+
+def test_a_hidden_voxel_that_rays_pass_again_is_observed():
+    sensor, ends = np.array([0.31, 0.52, 0.63]), uniform(7, 40)
+    old = np.random.default_rng(0).integers(-9, 10, SHAPE)
+    window = empty_window()._replace(passes=jnp.asarray(old, jnp.float32))
+    new = np.asarray(trace(empty_window(), ends, sensor).passes)
+    assert np.sum((new > 0) & (old < 0)) > 10 < np.sum((new == 0) & (old < 0))
+    expected = np.where(new > 0, np.abs(old) + new, old)
+    np.testing.assert_array_equal(trace(window, ends, sensor).passes, expected)

@@ -101,3 +101,27 @@ def test_far_returns_are_averaged_like_near_ones():
     index, _, _ = geometry.voxel_of(config, jnp.asarray([[30.05, 0.05, 0.05]]))
     mean = np.asarray(stored.mean)[tuple(np.asarray(index)[0])]
     assert abs(0.1 * mean[0] - offsets.mean()) < 1e-3
+
+
+def test_a_voxel_is_observed_unless_it_is_hidden_or_no_ray_has_met_it():
+    passes = jnp.asarray([0, 2, -2, 0, 3, -3], jnp.float32)
+    hits = jnp.asarray([0, 0, 0, 1, 1, 9], jnp.float32)
+    expected = [False, True, False, True, True, False]
+    np.testing.assert_array_equal(evidence.is_observed(passes, hits), expected)
+
+
+def test_hidden_voxels_and_changes_are_stored():
+    rng = np.random.default_rng(5)
+    passes, change = rng.integers(-9, 10, SHAPE), rng.integers(-72, 9, SHAPE)
+    window = empty_window()._replace(
+        passes=jnp.asarray(passes, jnp.float32), change=jnp.asarray(change, jnp.int8)
+    )
+    stored = evidence.write_window(
+        evidence.empty_grid(CONFIG).evidence, fade_evidence(CONFIG, window)
+    )
+    np.testing.assert_array_equal(stored.passes, passes)
+    np.testing.assert_array_equal(stored.change, change)
+    read = evidence.read_window(CONFIG, stored, rays_to([[0.3, 0.5, 0.7]], (0.3, 0.5, 0.6)))
+    np.testing.assert_array_equal(read.passes, passes)
+    np.testing.assert_array_equal(read.change, change)
+    assert stored.change.dtype == jnp.int8

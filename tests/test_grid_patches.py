@@ -145,3 +145,24 @@ def test_a_vanished_wall_is_carved_and_a_new_one_counts_as_surface():
     # The wall's evidence, at the limit, fades at the rate at which rays pass: within 60 clouds.
     assert 30 <= gone < 60
     assert history[-1] == (False, True)
+
+
+def test_hidden_patches_are_still_surfaces_as_they_were():
+    rng = np.random.default_rng(13)
+    hits, passes = (rng.integers(0, 60, 500).astype(np.float32) for _ in range(2))
+    axes = np.zeros((500, 3, 3), np.float32)
+    axes[:, 0, 0] = axes[:, 1, 1] = rng.uniform(0.01, 0.3, 500)
+    seen, hidden = (patches.is_feature(CONFIG, hits, s * passes, axes) for s in (1, -1))
+    np.testing.assert_array_equal(hidden, seen)
+    assert 0.1 < np.mean(seen) < 0.95
+
+
+def test_a_single_hit_is_in_doubt_sooner():
+    """It may be stray: five rays beside it say so, where two hits need many."""
+    passes = np.arange(200, dtype=np.float32)
+    single = np.asarray(patches.is_doubtful(np.ones(200, np.float32), passes))
+    np.testing.assert_array_equal(single, passes <= 5)  # 1 / 6 > 0.15 > 1 / 7
+    double = np.asarray(patches.is_doubtful(np.full(200, 2, np.float32), passes))
+    np.testing.assert_array_equal(double, passes <= 98)  # 2 / 100
+    assert np.asarray(patches.is_doubtful(np.ones(200, np.float32), -passes)).all()
+    assert not np.asarray(patches.is_doubtful(np.zeros(200, np.float32), passes)).any()

@@ -20,3 +20,13 @@ def test_ranges_are_measured_after_a_pose_with_rounding_errors():
     np.testing.assert_array_equal(rays.ends, [False, True, False, False])
     np.testing.assert_allclose(rays.free_ranges, [1, 0.9018, 1, 1], rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(rays.directions_world, axis=1), 1, rtol=1e-6)
+
+
+def test_the_deviation_of_a_return_grows_with_its_range_up_to_the_largest():
+    cloud = np.array([[0, 0, 0.5], [0, 2.0, 0], [9.0, 0, 0]], np.float32)
+    pose = jnp.eye(4)
+    ranges = np.array([0.5, 2.0, CONFIG.max_range])
+    for noise in (None, (0.02, 0.004)):
+        rays = place_cloud(CONFIG, jnp.asarray(cloud), np.ones(3, bool), pose, noise)
+        a, b = noise or CONFIG.range_noise
+        np.testing.assert_allclose(rays.sigma, a + b * ranges**2, rtol=1e-6)

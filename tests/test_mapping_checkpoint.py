@@ -72,10 +72,27 @@ def test_load_names_what_is_wrong(room_map, tmp_path):
     np.savez(path, **(arrays | {"grid.hits": arrays["grid.hits"][1:]}))
     with pytest.raises(ValueError, match=r"has grid\.hits of float16"):
         hio.load(path)
-    newer = str(arrays["header"]).replace('"version": 2', '"version": 99')
-    np.savez(path, **(arrays | {"header": np.asarray(newer)}))
-    with pytest.raises(ValueError, match="format version 99, expected 2"):
-        hio.load(path)
+    for version in (1, 99):
+        other = str(arrays["header"]).replace('"version": 3', f'"version": {version}')
+        np.savez(path, **(arrays | {"header": np.asarray(other)}))
+        with pytest.raises(ValueError, match=f"format version {version}, expected 2 or 3"):
+            hio.load(path)
+    # Only files of version 2 may lack what version 3 has added.
+    for name in NEW_ARRAYS:
+        short = {known: array for known, array in arrays.items() if known != name}
+        np.savez(path, **short)
+        with pytest.raises(ValueError, match=f"lacks the array {name}"):
+            hio.load(path)
+
+
+# What version 3 has added: shapes in the file below, and types.
+NEW_ARRAYS = {
+    "grid.change": ((4, 3, 2), np.int8),
+    "report.points_moving": ((), np.int32),
+    "report.refused_in_row": ((), np.int32),
+    "report.update_flags": ((), np.uint32),
+}
+NEW_FIELDS = {"min_in_range": 0.02, "most_refusals": 7, "vanish_scans": 4}
 
 
 def file_of_version_2():
@@ -160,7 +177,9 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
     header, arrays = file_of_version_2()
     np.savez(tmp_path / "old.npz", header=np.asarray(json.dumps(header)), **arrays)
     state = hio.load(tmp_path / "old.npz")
-    assert json.loads(json.dumps(dataclasses.asdict(state.config))) == header["config"]
+    config = json.loads(json.dumps(dataclasses.asdict(state.config)))
+    defaults = hio.Config.default(state.config.bounds)
+    assert config == header["config"] | {name: getattr(defaults, name) for name in NEW_FIELDS}
     evidence, derived, network = state.grid.evidence, state.grid.derived, state.network
     places = {
         "grid.hits": evidence.hits,
@@ -189,11 +208,58 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
     }
     for name, array in places.items():
         np.testing.assert_array_equal(array, arrays[name], err_msg=name)
+    report = state.report
+    new = (evidence.change, report.points_moving, report.refused_in_row, report.update_flags)
+    for array, (shape, dtype) in zip(new, NEW_ARRAYS.values(), strict=True):
+        assert array.shape == shape and array.dtype == dtype
+        assert not np.asarray(array).any()
+
+
+def test_a_map_of_version_2_continues_as_one_of_version_3(room_map, tmp_path):
+    """A map in which nothing has changed lacks nothing but zeros."""
+    hio.save(tmp_path / "new.npz", room_map)
+    with np.load(tmp_path / "new.npz") as file:
+        arrays = {name: file[name] for name in file.files if name not in NEW_ARRAYS}
+    header = json.loads(str(arrays.pop("header"))) | {"version": 2}
+    for name in NEW_FIELDS:  # those of this map are the defaults
+        del header["config"][name]
+    np.savez(tmp_path / "old.npz", header=np.asarray(json.dumps(header)), **arrays)
+    old = hio.load(tmp_path / "old.npz")
+    assert old.config == room_map.config
+    report, change = room_map.report, room_map.grid.evidence.change
+    expected = room_map.replace(
+        report=report.replace(
+            points_moving=0 * report.points_moving,
+            refused_in_row=0 * report.refused_in_row,
+            update_flags=0 * report.update_flags,
+        ),
+        grid=room_map.grid.replace(evidence=room_map.grid.evidence.replace(change=0 * change)),
+    )
+    assert arrays_equal(old, expected)
+    frame = stream(6)[5]
+    assert arrays_equal(hio.update(old, *frame), hio.update(expected, *frame))
+
+
+def file_of_version_3():
+    """The same for version 3."""
+    header, arrays = file_of_version_2()
+    header = header | {"version": 3, "config": header["config"] | NEW_FIELDS}
+    new = {name: np.zeros(shape, dtype) for name, (shape, dtype) in NEW_ARRAYS.items()}
+    new["grid.change"][1, 2, 0], new["grid.change"][3, 0, 1] = 8, -72
+    return header, arrays | new
+
+
+def test_a_file_of_format_version_3_keeps_its_changes(tmp_path):
+    header, arrays = file_of_version_3()
+    np.savez(tmp_path / "map.npz", header=np.asarray(json.dumps(header)), **arrays)
+    state = hio.load(tmp_path / "map.npz")
+    assert json.loads(json.dumps(dataclasses.asdict(state.config))) == header["config"]
+    np.testing.assert_array_equal(state.grid.evidence.change, arrays["grid.change"])
 
 
 def test_names_in_a_file_do_not_change(tmp_path):
     """They are part of its format; attributes of the code may be renamed."""
-    header, arrays = file_of_version_2()
+    header, arrays = file_of_version_3()
     config = hio.Config(**header["config"])
     hio.save(tmp_path / "map.npz", hio.init(config, jax.random.key(0)))
     with np.load(tmp_path / "map.npz") as file:

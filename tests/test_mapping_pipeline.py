@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
@@ -223,18 +224,33 @@ def test_init_and_queries_name_wrong_arguments(room_map):
     assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))
 
 
-def test_a_cloud_out_of_range_still_trains_on_the_grid(room_map):
-    """Its rays still clear space, and no flag is raised."""
-    for cloud in (np.full((50, 3), 30.0), np.zeros((4, 3))):
+OUT_OF_RANGE = {"far": np.full((50, 3), 30.0), "near": np.zeros((4, 3))}
+
+
+@pytest.mark.parametrize("cloud", OUT_OF_RANGE.values(), ids=OUT_OF_RANGE.keys())
+def test_a_cloud_out_of_range_changes_nothing_but_the_flags(room_map, cloud):
+    with pytest.warns(UserWarning, match=f"cloud has 0 of {len(cloud)} returns between"):
         after = hio.update(room_map, cloud, np.eye(4))
-        assert int(after.report.flags) == int(room_map.report.flags)
-        assert np.isfinite(float(after.report.sdf_loss))
-        assert int(after.updates) == int(room_map.updates) + 1
-        assert not arrays_equal(after.network.params, room_map.network.params)
-    far = hio.update(room_map, np.full((50, 3), 30.0), np.eye(4))
+    flag = jnp.uint32(hio.Flag.OUT_OF_RANGE)
+    report = room_map.report.replace(update_flags=flag, flags=room_map.report.flags | flag)
+    assert arrays_equal(after, room_map.replace(report=report))
+
+
+def test_a_cloud_out_of_range_clears_space_and_trains_if_none_need_be_in_range(room_map):
+    """Its rays clear space, and no flag is raised."""
+    state = room_map.replace(config=dataclasses.replace(CONFIG, min_in_range=0.0))
     index, _, _ = geometry.voxel_of(CONFIG, jnp.asarray([[0.3, 0.3, 0.3]]))
     at = tuple(np.asarray(index)[0])
-    assert float(far.grid.evidence.passes[at]) > float(room_map.grid.evidence.passes[at])
+    for name, cloud in OUT_OF_RANGE.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            after = hio.update(state, cloud, np.eye(4))
+        assert int(after.report.flags) == int(after.report.update_flags) == 0
+        assert np.isfinite(float(after.report.sdf_loss))
+        assert int(after.updates) == int(state.updates) + 1
+        assert not arrays_equal(after.network.params, state.network.params)
+        clears = float(after.grid.evidence.passes[at]) > float(state.grid.evidence.passes[at])
+        assert clears == (name == "far")
 
 
 def test_a_fresh_state_can_be_donated():

@@ -42,6 +42,24 @@ def test_returns_on_the_robot_change_nothing(empty_map):
     assert float(hio.sdf(ghost, CENTERS[0])) < 0.1 < float(hio.sdf(actual, CENTERS[0]))
 
 
+def test_an_arm_that_was_mapped_before_its_pose_was_known_is_removed(empty_map):
+    cloud, covered, _, pose = cloud_with_an_arm()
+    ghost = hio.update(empty_map, covered, pose)
+    cleared = hio.update(ghost, cloud, pose, robot=(CENTERS, RADII + 0.02))
+    hits, mean = (
+        np.asarray(x, float) for x in (ghost.grid.evidence.hits, ghost.grid.evidence.mean)
+    )
+    cells = np.argwhere(hits > 0)
+    patches = (cells + CONFIG.corner_index + 0.5 + mean[tuple(cells.T)]) * CONFIG.voxel_size
+    apart = np.linalg.norm(patches[:, None] - CENTERS, axis=-1) - (RADII + 0.02)
+    inside = tuple(cells[(apart < -0.002).any(axis=1)].T)
+    assert len(inside[0]) >= 3
+    assert (hits[inside] > 0).all()
+    assert not np.asarray(cleared.grid.evidence.hits)[inside].any()
+    assert (np.asarray(cleared.grid.evidence.passes)[inside] > 0).all()
+    assert float(hio.sdf(cleared, CENTERS[0])) > 0.1 > float(hio.sdf(ghost, CENTERS[0]))
+
+
 def test_surfaces_just_beyond_the_margin_stay(empty_map):
     cloud, pose = room_cloud(0)
     expected = hio.update(empty_map, cloud, pose)
@@ -128,6 +146,6 @@ def test_a_pose_too_far_away_is_refused(empty_map):
     padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
     padded[: len(cloud)] = cloud
     inside = pipeline._update_jit(empty_map, padded, pose)  # what `update` compiles
-    assert hio.Flag(int(inside.report.flags)) == hio.Flag.BAD_POSE
-    flags = empty_map.report.flags
-    assert arrays_equal(inside.replace(report=inside.report.replace(flags=flags)), empty_map)
+    flag = jnp.uint32(hio.Flag.BAD_POSE)
+    flagged = empty_map.report.replace(flags=flag, update_flags=flag)
+    assert arrays_equal(inside, empty_map.replace(report=flagged))

@@ -1,4 +1,4 @@
-"""The list of stages is what `update` runs."""
+"""The list of stages is what `update` runs: the checks, and the rest if a cloud passes them."""
 
 import jax
 import jax.extend.core as jex
@@ -7,48 +7,65 @@ import pytest
 from room import stream
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.stages import STAGES, begin
+from hiosdf_jax._src.mapping.stages import CHECKS, FUSION, STAGES, begin, is_accepted, refuse
 
 
 @pytest.fixture(scope="module")
-def program(empty_map):
-    """What `update` computes for a usable cloud, as a jaxpr."""
-    cloud, pose = (jnp.asarray(array) for array in stream(1)[0])
-    checked = jax.make_jaxpr(hio.update)(empty_map, cloud, pose)
-    (choice,) = (e for e in checked.eqns if e.primitive.name == "cond")
-    return max(choice.params["branches"], key=lambda branch: len(branch.eqns))
+def frame():
+    return tuple(jnp.asarray(array) for array in stream(1)[0])
 
 
-def scopes(jaxpr):
-    """Yields the named scopes of a jaxpr's equations, and of the jaxprs in them, in order."""
-    for equation in jaxpr.eqns:
+@pytest.fixture(scope="module")
+def program(empty_map, frame):
+    """What `update` computes, as a jaxpr."""
+    return jax.make_jaxpr(hio.update)(empty_map, *frame)
+
+
+def scopes(equations):
+    """Yields the named scopes of equations, and of those in the jaxprs in them, in order."""
+    for equation in equations:
         yield str(equation.source_info.name_stack)
         for part in jax.tree.leaves(
             list(equation.params.values()),
             is_leaf=lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr),
         ):
             if isinstance(part, jex.ClosedJaxpr | jex.Jaxpr):
-                yield from scopes(part)
+                yield from scopes(part.eqns)
+
+
+def stages_in(equations):
+    """The stages whose scopes these equations have, in order."""
+    names = [stage.__name__ for stage in STAGES]
+    found = [scope.partition("/")[0] for scope in scopes(equations)]
+    return list(dict.fromkeys(name for name in found if name in names))
 
 
 def test_update_runs_each_stage_in_a_scope_of_its_name(program):
-    names = [stage.__name__ for stage in STAGES]
-    found = [scope.partition("/")[0] for scope in scopes(program)]
-    assert list(dict.fromkeys(name for name in found if name in names)) == names
+    assert STAGES == CHECKS + FUSION
+    equations = program.eqns
+    (at,) = [k for k, e in enumerate(equations) if e.primitive.name == "cond"]
+    assert stages_in(equations[:at]) == [stage.__name__ for stage in CHECKS]
+    assert stages_in(equations[at + 1 :]) == []
+    refused, accepted = equations[at].params["branches"]
+    assert stages_in(accepted.eqns) == [stage.__name__ for stage in FUSION]
+    assert stages_in(refused.eqns) == []
 
 
-def test_update_is_the_stages_one_by_one(program, empty_map):
+def test_update_is_the_stages_one_by_one(program, empty_map, frame):
     """Both are the same program, so their maps are equal bit by bit."""
 
-    def by_hand(state, cloud, finite, pose):
-        step = begin(state, cloud, finite, pose)
-        for stage in STAGES:
+    def fused(_, step):
+        for stage in FUSION:
             step = stage(step)
         return step.state
+
+    def by_hand(state, cloud, pose):
+        step = begin(state, cloud, jnp.all(jnp.isfinite(cloud), axis=-1), pose)
+        for stage in CHECKS:
+            step = stage(step)
+        return jax.lax.cond(is_accepted(step), fused, refuse, state, step)
 
     def text(jaxpr):  # without the mark between constants and arguments
         return " ".join(str(jaxpr).replace(";", "").split())
 
-    cloud, pose = (jnp.asarray(array) for array in stream(1)[0])
-    finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    assert text(program) == text(jax.make_jaxpr(by_hand)(empty_map, cloud, finite, pose))
+    assert text(program) == text(jax.make_jaxpr(by_hand)(empty_map, *frame))

@@ -71,10 +71,11 @@ def test_vmap_over_two_maps_equals_each(empty_map):
 def test_bad_input_inside_jit_only_raises_a_sticky_flag(room_map, cloud, pose, flag):
     after = jax.jit(hio.update)(room_map, jnp.asarray(cloud), jnp.asarray(pose))
     assert hio.Flag(int(after.report.flags)) == flag
-    flags = room_map.report.flags
-    assert arrays_equal(after.replace(report=after.report.replace(flags=flags)), room_map)
+    flagged = room_map.report.replace(flags=jnp.uint32(flag), update_flags=jnp.uint32(flag))
+    assert arrays_equal(after, room_map.replace(report=flagged))
     later = hio.update(after, *stream(1)[0])
     assert hio.Flag(int(later.report.flags)) == flag
+    assert int(later.report.update_flags) == 0
 
 
 def test_snapshot_is_independent_of_a_donated_map(empty_map):

@@ -45,6 +45,7 @@ def whole_window(stored):
         weight=stored.root_weight.astype(jnp.float32) ** 2,
         mean=stored.mean,
         axes=stored.axes,
+        change=stored.change,
     )
 
 
@@ -61,6 +62,7 @@ def grid_of(window, derived):
         root_weight=jnp.sqrt(window.weight),
         mean=window.mean,
         axes=window.axes,
+        change=window.change,
     )
     return Grid(evidence=stored, derived=derived)
 
@@ -69,7 +71,7 @@ def uniform(seed, count, low=BOUNDS[0], high=BOUNDS[1]):
     return np.random.default_rng(seed).uniform(low, high, (count, 3)).astype(np.float32)
 
 
-def rays_to(ends, sensor, hit=True):
+def rays_to(ends, sensor, hit=True, noise=CONFIG.range_noise):
     """Rays from the sensor to all ends; `hit` says which of them end on a surface."""
     ends, sensor = np.asarray(ends, np.float32), np.asarray(sensor, np.float32)
     ranges = np.linalg.norm(ends - sensor, axis=1)
@@ -81,6 +83,7 @@ def rays_to(ends, sensor, hit=True):
         in_range=every,
         ends=every & hit,
         inside=every,
+        sigma=jnp.asarray(noise[0] + noise[1] * ranges**2, jnp.float32),
         sensor_world=jnp.asarray(sensor),
     )
 

@@ -40,13 +40,20 @@ class Config:
         min_range: Nearer returns are ignored, m.
         max_range: Farther returns only clear their ray up to this range, m.
         range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m.
-            Hits are averaged with weight 1 / sigma^2, so only relative sizes matter.
+            Hits are averaged with weight 1 / sigma^2.
+        min_in_range: A cloud with a smaller share of its returns between min_range and max_range
+            changes nothing and raises `Flag.OUT_OF_RANGE`. With 0 its rays clear space.
+        most_refusals: Clouds in a row that are refused because they contradict the map; the next
+            one is fused. With 0 all clouds are fused.
 
         Grid [IV-B]:
         min_hits: Hits that a voxel needs before its patch counts as surface.
         min_hit_ratio: A patch that fills its voxel is carved below this share
             hits / (hits + passes); smaller patches need less, by their area.
         evidence_limit: Rays that a voxel remembers; older evidence fades beyond that.
+        vanish_scans: Scans that must look through most of a surface patch, without a hit between
+            them, before it vanishes. Patches of few hits need fewer scans; so do scans with rays
+            through all of it. Scans with rays through half of it, as of one LiDAR ring, count half.
         distance_horizon: Largest distance to a patch that the grid resolves, m; <= 127 voxels.
         frontier_horizon: Largest distance to unseen space that the grid resolves, m.
 
@@ -96,11 +103,14 @@ class Config:
     min_range: float = _number(0.1, 0.0, 1e4)
     max_range: float = _number(20.0, 1e-3, 1e4)
     range_noise: tuple[float, float] = (0.005, 0.002)
+    min_in_range: float = _number(0.01, 0.0, 1.0)
+    most_refusals: int = _number(10, 0, 1_000_000)
 
     # Grid
     min_hits: int = _number(2, 1, 1_000)
     min_hit_ratio: float = _number(0.25, 0.0, 1.0)
     evidence_limit: float = _number(100.0, 1.0, 1000.0)
+    vanish_scans: int = _number(3, 1, 30)
     distance_horizon: float = _number(3.0, 1e-3, 1e4)
     frontier_horizon: float = _number(1.0, 1e-3, 1e4)
 

@@ -24,7 +24,7 @@ def frontier_step_m(config: Config) -> float:
 
 
 class Flag(enum.IntFlag):
-    """Problems since the map was made: bits of `Report.flags`, never cleared."""
+    """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`."""
 
     BAD_POSE = 1
     """A pose was not finite, not rigid, or 100 km away. That update changed nothing else."""
@@ -34,10 +34,19 @@ class Flag(enum.IntFlag):
     """Returns in range fell outside the bounds. Their rays cleared space but left no surface."""
     TRAINING_FAILED = 8
     """A training step was not finite. The network was kept as it was."""
+    OUT_OF_RANGE = 16
+    """Almost no return was in range; see `Config.min_in_range`. That update changed nothing else:
+    check the unit, which must be m."""
+    INCONSISTENT_CLOUD = 32
+    """A cloud contradicted the map as a whole. It was not fused, unless `Config.most_refusals`
+    clouds in a row had been refused before it: check the pose and the sensor."""
 
 
 class Report(flax.struct.PyTreeNode):
     """Summary of the last update; `flags` collects those of all updates.
+
+    Updates that changed nothing else leave all numbers as they were, but for the flags and
+    `refused_in_row`.
 
     Attributes:
         points_used: Points that were fused into the grid, int32.
@@ -46,7 +55,10 @@ class Report(flax.struct.PyTreeNode):
         points_invalid: Rows with a NaN or inf, padding included, int32.
         sdf_loss: Mean |f - s| over the samples in the last epoch, m, float32 (paper, eq. 4).
         eikonal_loss: Mean | |grad f| - 1 | in the last epoch, float32 (paper, eq. 5).
-        flags: Bits of `Flag`, uint32, sticky.
+        points_moving: Returns in space that had been free: on things that move or are new, int32.
+        refused_in_row: Clouds since the last one that was fused which contradicted the map, int32.
+        update_flags: Bits of `Flag` of the last update alone, uint32.
+        flags: Bits of `Flag` of all updates so far, uint32.
     """
 
     points_used: jax.Array
@@ -55,6 +67,9 @@ class Report(flax.struct.PyTreeNode):
     points_invalid: jax.Array
     sdf_loss: jax.Array
     eikonal_loss: jax.Array
+    points_moving: jax.Array
+    refused_in_row: jax.Array
+    update_flags: jax.Array
     flags: jax.Array
 
 
@@ -65,13 +80,18 @@ class Evidence(flax.struct.PyTreeNode):
 
     Attributes:
         hits: Rays that ended in the voxel (fading), (X, Y, Z) float16.
-        passes: Rays that went through it well before their end (fading), (X, Y, Z) float16.
+        passes: Rays that went through it well before their end (fading), (X, Y, Z) float16;
+            negative in a voxel that something new hides now, which counts as unobserved.
         behind: Rays that ended a little before it (fading), (X, Y, Z) float16.
         root_weight: Square root of the summed weights of the hits (fading), (X, Y, Z) float16; the
             weights of far returns are too small for float16.
         mean: Weighted mean of the hits, (X, Y, Z, 3) float16.
         axes: Principal axes of the hits, longest first, each as long as the standard deviation
             along it, (X, Y, Z, 3, 3) float16. The last one is the normal, on the sensor's side.
+        change: Recent changes, (X, Y, Z) int8. k > 0: a surface appeared in free space and counts
+            as new for k more scans that see it. -64 <= k < 0: rays have crossed the patch since its
+            last hit; see `change.vanishing`. k < -64: it vanished, and counts as recent for -64 - k
+            more scans that pass there.
     """
 
     hits: jax.Array
@@ -80,6 +100,7 @@ class Evidence(flax.struct.PyTreeNode):
     root_weight: jax.Array
     mean: jax.Array
     axes: jax.Array
+    change: jax.Array
 
 
 class Derived(flax.struct.PyTreeNode):

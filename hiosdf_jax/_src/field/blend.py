@@ -74,9 +74,10 @@ def frontier(field: Field, points_world: jax.Array) -> jax.Array:
 
 
 def lower(field: Field, points_world: jax.Array) -> jax.Array:
-    """Computes a lower bound of the true distance at observed points.
+    """Computes a lower bound of the true distance.
 
-    The bound is cautious - optimism * scale. `mapping.calibration` measures the optimism.
+    The bound is cautious - optimism * scale. `mapping.calibration` measures the optimism. In unseen
+    space, which may be solid, the bound is at most the distance to the frontier, which is negative.
 
     Args:
         field: The field.
@@ -86,7 +87,9 @@ def lower(field: Field, points_world: jax.Array) -> jax.Array:
         (...) m.
     """
     cautious, scale = cautious_sdf(field, points_world)
-    return cautious - field.optimism * scale
+    bound = cautious - field.optimism * scale
+    unseen = frontier(field, points_world)
+    return jnp.where(unseen < 0, jnp.minimum(bound, unseen), bound)
 
 
 def network_sdf(field: Field, points_world: jax.Array) -> jax.Array:

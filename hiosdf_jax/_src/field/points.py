@@ -16,6 +16,10 @@ from hiosdf_jax._src.state import Baked, Field, MapState, Query, field_of
 
 _FAR = 1e30  # m
 
+# From this deep in unseen space on, m, only the distance to the frontier counts. Less makes a bump
+# where the frontier takes over.
+_DEEP_M = 0.4
+
 AnyField = MapState | Field | Baked
 Unknown = Literal["network", "obstacle"]
 
@@ -30,7 +34,8 @@ def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array
         field: A map, a snapshot of one, or a baked field.
         points: (..., 3) m, world frame.
         unknown: Policy for unseen space. "network" returns the map's prediction there. "obstacle"
-            treats unseen space as solid: the result is min(sdf, frontier).
+            treats unseen space as solid: the result is min(sdf, frontier) in observed space and,
+            from 40 cm deep in unseen space on, the frontier's negative distance alone.
 
     Returns:
         (...) float32, m; positive in free space, negative behind surfaces. Differentiable.
@@ -130,7 +135,14 @@ def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown) -> jax.
     place = _place(field, points)
     value = _answers_of(field).sdf(field, place.nearest)
     value = value + jnp.where(jnp.any(jnp.isnan(points), axis=-1), -place.beyond, place.beyond)
-    return value if unknown == "network" else jnp.minimum(value, _frontier(field, place))
+    if unknown == "network":
+        return value
+    frontier = _frontier(field, place)
+    solid = jnp.minimum(value, frontier)
+    # Deep in unseen space the frontier answers alone: its gradient leads out, that of a guess
+    # about what stands there need not.
+    deep = jnp.clip(-frontier / _DEEP_M, 0, 1)
+    return solid + deep * (frontier - solid)
 
 
 class _Place(NamedTuple):

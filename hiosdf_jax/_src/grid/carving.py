@@ -62,8 +62,13 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
         return done + _CHUNK, count(passes, steps, steps < free[:, None])
 
     _, passes = jax.lax.while_loop(
-        lambda carry: carry[0] < longest, advance, (jnp.float32(0), window.passes.ravel())
+        lambda carry: carry[0] < longest,
+        advance,
+        (jnp.float32(0), jnp.zeros(voxels, window.passes.dtype)),
     )
+    passes = passes.reshape(shape)
+    # A hidden voxel (negative) that rays pass again is observed.
+    passes = jnp.where(passes > 0, jnp.abs(window.passes) + passes, window.passes)
     steps = (
         (ranges / size)[:, None]
         + 0.5
@@ -72,7 +77,7 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
     )
     hidden = jnp.broadcast_to((rays.in_range & ends)[:, None], steps.shape)
     behind = count(window.behind.ravel(), steps, hidden)
-    return window._replace(passes=passes.reshape(shape), behind=behind.reshape(shape))
+    return window._replace(passes=passes, behind=behind.reshape(shape))
 
 
 def _phases(count: int) -> jax.Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.grid.windows import RayBox, Window, recompute
+from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
 from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid
@@ -150,6 +150,11 @@ def update_distances(config: Config, grid: Grid, box: RayBox) -> Grid:
         return _distances_in(config, grid, window)
 
     return grid.replace(derived=recompute(config, box, horizon_m, inside))
+
+
+def recompute_distances(config: Config, grid: Grid) -> Grid:
+    """Recomputes the distances and signs of the whole grid."""
+    return grid.replace(derived=_distances_in(config, grid, whole_grid(config)))
 
 
 def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:

@@ -30,6 +30,7 @@ class EvidenceWindow(NamedTuple):
         weight: Summed weights of the hits, float32.
         mean: As in `Evidence`, float16.
         axes: As in `Evidence`, float16.
+        change: As in `Evidence`, int8.
     """
 
     start: jax.Array
@@ -39,6 +40,7 @@ class EvidenceWindow(NamedTuple):
     weight: jax.Array
     mean: jax.Array
     axes: jax.Array
+    change: jax.Array
 
 
 def empty_grid(config: Config) -> Grid:
@@ -52,6 +54,7 @@ def empty_grid(config: Config) -> Grid:
             root_weight=jnp.zeros(shape, _STORED),
             mean=jnp.zeros((*shape, 3), _STORED),
             axes=jnp.zeros((*shape, 3, 3), _STORED),
+            change=jnp.zeros(shape, jnp.int8),
         ),
         derived=Derived(
             nearest=jnp.full((*shape, 3), NO_FEATURE, jnp.int8),
@@ -88,6 +91,7 @@ def read_window(config: Config, evidence: Evidence, rays: Rays) -> EvidenceWindo
         weight=read(evidence.root_weight).astype(jnp.float32) ** 2,
         mean=read(evidence.mean),
         axes=read(evidence.axes),
+        change=read(evidence.change),
     )
 
 
@@ -121,13 +125,13 @@ def is_observed(passes: jax.Array, hits: jax.Array) -> jax.Array:
     """Returns a mask of the voxels that a ray has reached.
 
     Args:
-        passes: Rays that went through the voxel, (...).
+        passes: Rays that went through the voxel, (...); negative where it is hidden again.
         hits: Rays that ended in it, (...).
 
     Returns:
         (...) bool.
     """
-    return (passes > 0) | (hits > 0)
+    return (passes > 0) | ((hits > 0) & (passes >= 0))
 
 
 def _rounded(values: jax.Array) -> jax.Array:
@@ -157,4 +161,5 @@ def write_window(evidence: Evidence, window: EvidenceWindow) -> Evidence:
         root_weight=write(evidence.root_weight, jnp.sqrt(window.weight)),
         mean=write(evidence.mean, window.mean),
         axes=write(evidence.axes, window.axes),
+        change=write(evidence.change, window.change),
     )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import is_observed
-from hiosdf_jax._src.grid.windows import RayBox, Window, recompute
+from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
 
@@ -68,6 +68,12 @@ def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:
         return _frontier_in(config, grid, window)
 
     steps = recompute(config, box, horizon_m, inside)
+    return grid.replace(derived=grid.derived.replace(frontier_steps=steps))
+
+
+def recompute_frontier(config: Config, grid: Grid) -> Grid:
+    """Recomputes the distances to unseen space of the whole grid."""
+    steps = _frontier_in(config, grid, whole_grid(config))
     return grid.replace(derived=grid.derived.replace(frontier_steps=steps))
 
 

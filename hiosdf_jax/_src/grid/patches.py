@@ -19,7 +19,7 @@ from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
 # Half extent of a patch along a principal axis, in standard deviations. Uniform hits have sqrt(3);
 # noise widens the spread, so it is a little less. Measured: 0.60 instead of 0.62 cm on a depth
 # stream, 0.71 instead of 0.73 cm on a LiDAR stream.
-_EXTENT_DEVIATIONS = 0.9 * 3**0.5
+EXTENT_DEVIATIONS = 0.9 * 3**0.5
 
 # Shorter axes (voxels) are stored with this length, so that a perfect plane keeps its normal.
 _LEAST_DEVIATION = 1e-3
@@ -32,21 +32,19 @@ _JACOBI_SWEEPS = 5
 # Smaller patches (voxels^2) need as many hits as a patch of this area: stray returns are small too.
 _LEAST_AREA = 0.2
 
-# A voxel in which at least this share of the rays ended may hold a surface.
+# A voxel in which at least this share of the rays ended may hold a surface. A single hit, which may
+# be stray, needs more.
 _DOUBT_RATIO = 0.02
+_SINGLE_DOUBT_RATIO = 0.15
 
 
-def fuse_hits(
-    config: Config, window: EvidenceWindow, rays: Rays, noise: jax.Array | None = None
-) -> EvidenceWindow:
+def fuse_hits(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWindow:
     """Merges the ends of rays into the surface statistics of their voxels.
 
     Args:
         config: The map's configuration.
         window: The evidence around the sensor.
         rays: The cloud; rows that do not end on a surface change nothing.
-        noise: (a, b) of this cloud's standard deviation a + b r^2, m and 1/m; that of the
-            configuration by default.
 
     Returns:
         The window with new hits, weight, mean and axes.
@@ -66,11 +64,8 @@ def fuse_hits(
     target = jnp.full(count, voxels, voxel.dtype).at[group].set(voxel)
     used = (voxel < voxels).astype(jnp.float32)
 
-    ranges = length(split(points_world[order] - sensor_world))
-    noise_floor, noise_growth = config.range_noise if noise is None else noise
-    weight = used / (1 + noise_growth / noise_floor * ranges**2) ** 2
-    if noise is not None:
-        weight = weight * (config.range_noise[0] / noise_floor) ** 2
+    noise_floor, _ = config.range_noise
+    weight = used * (noise_floor / rays.sigma[order]) ** 2
     offset = jnp.where(used[:, None] > 0, offset, 0)
 
     def total(values: jax.Array) -> jax.Array:
@@ -158,10 +153,10 @@ def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Arr
     Returns:
         (...) bool.
     """
-    half = _EXTENT_DEVIATIONS * jnp.sqrt(jnp.sum(axes.astype(jnp.float32) ** 2, axis=-1))
+    half = EXTENT_DEVIATIONS * jnp.sqrt(jnp.sum(axes.astype(jnp.float32) ** 2, axis=-1))
     area = jnp.prod(jnp.minimum(2 * half[..., :2], 1), axis=-1)
     ratio = config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
-    return (hits >= config.min_hits) & (hits >= ratio * (hits + passes))
+    return (hits >= config.min_hits) & (hits >= ratio * (hits + jnp.abs(passes)))
 
 
 def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
@@ -174,7 +169,8 @@ def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
     Returns:
         (...) bool.
     """
-    return (hits > 0) & (hits >= _DOUBT_RATIO * (hits + passes))
+    ratio = jnp.where(hits < 1.5, _SINGLE_DOUBT_RATIO, _DOUBT_RATIO)
+    return (hits > 0) & (hits >= ratio * (hits + jnp.maximum(passes, 0)))
 
 
 def patch_offset(point: Vector, mean: Vector, axes: tuple[Vector, Vector]) -> Vector:
@@ -193,7 +189,7 @@ def patch_offset(point: Vector, mean: Vector, axes: tuple[Vector, Vector]) -> Ve
     """
     offset = each(jnp.subtract, point, mean)
     for axis in axes:
-        half = each(lambda a: _EXTENT_DEVIATIONS * a, axis)
+        half = each(lambda a: EXTENT_DEVIATIONS * a, axis)
         square = jnp.maximum(dot(half, half), 1e-12)
         along = jnp.clip(dot(offset, half) / square, -1, 1)
         offset = each(lambda o, h, along=along: o - along * h, offset, half)

@@ -29,6 +29,7 @@ class Rays(NamedTuple):
             space.
         ends: The return is in range and not farther than max_range, (N,) bool; it is on a surface.
         inside: The end point lies in the bounds, (N,) bool.
+        sigma: Standard deviation of the range, (N,) m.
         sensor_world: Common origin, (3,) m.
     """
 
@@ -38,10 +39,17 @@ class Rays(NamedTuple):
     in_range: jax.Array
     ends: jax.Array
     inside: jax.Array
+    sigma: jax.Array
     sensor_world: jax.Array
 
 
-def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.Array) -> Rays:
+def place_cloud(
+    config: Config,
+    cloud: jax.Array,
+    finite: jax.Array,
+    pose: jax.Array,
+    noise: jax.Array | None = None,
+) -> Rays:
     """Transforms a cloud to the world frame.
 
     Args:
@@ -49,10 +57,13 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
         cloud: (N, 3) m, sensor frame.
         finite: (N,) bool; other rows are no returns.
         pose: (4, 4) T_world_sensor.
+        noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m; that of the
+            configuration by default.
 
     Returns:
         The rays.
     """
+    noise_floor, noise_growth = config.range_noise if noise is None else noise
     cloud = jnp.where(finite[:, None], cloud, 0)
     sensor_world = pose[:3, 3]
     offsets_world = jnp.sum(cloud[:, None, :] * pose[:3, :3], axis=-1)
@@ -61,13 +72,15 @@ def place_cloud(config: Config, cloud: jax.Array, finite: jax.Array, pose: jax.A
     in_range = finite & (ranges >= config.min_range)
     points_world = sensor_world + offsets_world
     _, _, inside = geometry.voxel_of(config, points_world)
+    free_ranges = jnp.minimum(ranges, config.max_range)
     return Rays(
         points_world=points_world,
         directions_world=offsets_world / jnp.maximum(ranges, 1e-6)[:, None],
-        free_ranges=jnp.minimum(ranges, config.max_range),
+        free_ranges=free_ranges,
         in_range=in_range,
         ends=in_range & (ranges <= config.max_range),
         inside=inside,
+        sigma=noise_floor + noise_growth * free_ranges**2,
         sensor_world=sensor_world,
     )
 

@@ -99,6 +99,12 @@ def place_windows(
     return small, large, jnp.max(box.high_world - box.low_world) <= 2 * small_reach_m
 
 
+def whole_grid(config: Config) -> Window:
+    """Returns the window that reads and writes the whole grid."""
+    start = tuple(jnp.zeros((), jnp.int32) for _ in range(3))
+    return Window(start, config.grid_shape, start, config.grid_shape)
+
+
 def recompute[T](
     config: Config, box: RayBox, horizon_m: float, function: Callable[[Window], T]
 ) -> T:

@@ -21,7 +21,7 @@ from hiosdf_jax._src.mapping.pipeline import init
 from hiosdf_jax._src.state import MapState
 
 _FORMAT = "hiosdf_jax map"
-_VERSION = 2
+_VERSION = 3
 
 # Names in the file are part of its format; attributes of the code may be renamed.
 _FILE_NAMES = {
@@ -33,6 +33,14 @@ _FILE_NAMES = {
     "grid.derived.": "grid.surface.",
     "network.average.": "network.served.",
 }
+
+# Arrays that files of version 2 do not have; they are zero there.
+_SINCE_VERSION_3 = (
+    "grid.change",
+    "report.points_moving",
+    "report.refused_in_row",
+    "report.update_flags",
+)
 
 # Raised by numpy and zipfile for damaged files and for files that are no archives.
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, KeyError)
@@ -112,14 +120,17 @@ def load(path: str | os.PathLike[str]) -> MapState:
         version, fields, key_impl = header["version"], header["config"], header["key"]
     except (KeyError, TypeError, json.JSONDecodeError):
         raise ValueError(f"{path} is not a hiosdf_jax map: it has no such header") from None
-    if version != _VERSION:
-        raise ValueError(f"{path} has format version {version}, expected {_VERSION}")
+    if version not in (2, _VERSION):
+        raise ValueError(f"{path} has format version {version}, expected 2 or {_VERSION}")
     try:
         config = Config(**fields)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} has no valid configuration: {error}") from error
     template = jax.eval_shape(lambda: _without_key(init(config, jax.random.key(0, impl=key_impl))))
     expected = _named_leaves(template)
+    if version == 2:
+        new = {name: expected[name] for name in _SINCE_VERSION_3}
+        arrays = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in new.items()} | arrays
     for name, leaf in expected.items():
         if name not in arrays:
             raise ValueError(f"{path} lacks the array {name}")

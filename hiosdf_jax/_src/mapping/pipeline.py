@@ -13,11 +13,22 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.mapping.calibration import initial_optimism
-from hiosdf_jax._src.mapping.stages import begin, run_stages
+from hiosdf_jax._src.mapping.stages import (
+    CHECKS,
+    FUSION,
+    begin,
+    is_accepted,
+    refuse,
+    run_stages,
+)
 from hiosdf_jax._src.network.training import init_network
-from hiosdf_jax._src.numerics.posed_cloud import check_extras, check_shapes, prepare
-from hiosdf_jax._src.numerics.rigid import is_rigid
-from hiosdf_jax._src.state import Field, Flag, MapState, Report, field_of
+from hiosdf_jax._src.numerics.posed_cloud import (
+    check_extras,
+    check_shapes,
+    prepare,
+    warn_out_of_range,
+)
+from hiosdf_jax._src.state import Field, MapState, Report, field_of
 
 
 def init(config: Config, key: jax.Array) -> MapState:
@@ -59,6 +70,9 @@ def init(config: Config, key: jax.Array) -> MapState:
             points_invalid=zero(),
             sdf_loss=jnp.zeros((), jnp.float32),
             eikonal_loss=jnp.zeros((), jnp.float32),
+            points_moving=zero(),
+            refused_in_row=zero(),
+            update_flags=jnp.zeros((), jnp.uint32),
             flags=jnp.zeros((), jnp.uint32),
         ),
     )
@@ -114,7 +128,10 @@ def update(
         check_shapes(cloud, pose)
         return _update(state, jnp.asarray(cloud), jnp.asarray(pose), *extras)
     compiled = _update_donating if donate else _update_jit
-    return compiled(state, *prepare(cloud, pose, state.config.max_points), *extras)
+    config = state.config
+    cloud, pose = prepare(cloud, pose, config.max_points)
+    warn_out_of_range(cloud, config.min_range, config.max_range, config.min_in_range)
+    return compiled(state, cloud, pose, *extras)
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
@@ -173,24 +190,19 @@ def _update(
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    rigid = is_rigid(pose)
-    usable = rigid & jnp.any(finite)
-    flags = (
-        state.report.flags
-        | jnp.where(rigid, 0, Flag.BAD_POSE).astype(jnp.uint32)
-        | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD).astype(jnp.uint32)
+    step = run_stages(begin(state, cloud, finite, pose, robot, noise), CHECKS)
+    return jax.lax.cond(
+        is_accepted(step),
+        lambda _, step: run_stages(step, FUSION).state,
+        refuse,
+        state,
+        step,
     )
-    state = state.replace(report=state.report.replace(flags=flags))
-    arguments = (state, cloud, finite, pose, robot, noise)
-    return jax.lax.cond(usable, _integrate, lambda state, *_: state, *arguments)
-
-
-def _integrate(state: MapState, *arguments: Any) -> MapState:
-    return run_stages(begin(state, *arguments)).state
 
 
 _update_jit = jax.jit(_update)
-_update_donating = jax.jit(_update, donate_argnums=0)
+# Also leaves that an update does not read are donated.
+_update_donating = jax.jit(_update, donate_argnums=0, keep_unused=True)
 
 
 def _typed_key(key: Any) -> jax.Array:

@@ -6,17 +6,19 @@ a profiler shows each stage under its name. The speed benchmark times the same l
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.change import hiding, novelty, robot, stray, vanishing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches, rays, windows
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.mapping import calibration
 from hiosdf_jax._src.network import training
+from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.samples import from_cloud, from_grid
 from hiosdf_jax._src.samples.draw import Samples, concatenate
 from hiosdf_jax._src.state import Flag, Grid, MapState, Report, field_of
@@ -51,8 +53,11 @@ class Step(NamedTuple):
         keys: Sources of randomness.
         robot: Centers (K, 3) and radii (K,) of the robot's spheres, m, world frame, or None.
         noise: (a, b) of the cloud's noise, or None for that of the configuration.
+        flags: Bits of `Flag` of this update, () uint32.
         rays: The cloud in the world frame.
-        window: The evidence around the sensor, float32.
+        novelty: The cloud compared with the map before it.
+        before: The evidence around the sensor before this cloud, float32.
+        window: The same with this cloud.
         samples: Training samples.
         losses: Mean losses of the last epoch.
         trained: Whether training was finite, () bool.
@@ -65,7 +70,10 @@ class Step(NamedTuple):
     keys: Keys
     robot: tuple[jax.Array, jax.Array] | None = None
     noise: jax.Array | None = None
+    flags: jax.Array = _LATER
     rays: Rays = _LATER
+    novelty: novelty.Novelty = _LATER
+    before: evidence.EvidenceWindow = _LATER
     window: evidence.EvidenceWindow = _LATER
     samples: Samples = _LATER
     losses: training.Losses = _LATER
@@ -89,17 +97,38 @@ def begin(
     noise: jax.Array | None = None,
 ) -> Step:
     """Starts an update: draws its keys and stores the next one in the map."""
+    flags = jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD) | jnp.where(
+        is_rigid(pose), 0, Flag.BAD_POSE
+    )
     key, grid_key, cloud_key, order_key, bound_key = jax.random.split(state.key, 5)
     keys = Keys(bound=bound_key, grid=grid_key, cloud=cloud_key, order=order_key)
-    return Step(state.replace(key=key), cloud, finite, pose, keys, robot, noise)
+    state = state.replace(key=key)
+    return Step(state, cloud, finite, pose, keys, robot, noise, flags.astype(jnp.uint32))
 
 
 def place_cloud(step: Step) -> Step:
     """Transforms the cloud to the world frame, without the returns on the robot."""
-    placed = rays.place_cloud(step.config, step.cloud, step.finite, step.pose)
+    config = step.config
+    placed = rays.place_cloud(config, step.cloud, step.finite, step.pose, step.noise)
+    usable, returns = jnp.sum(placed.ends), jnp.sum(step.finite)
+    out_of_range = (step.flags == 0) & (usable < config.min_in_range * returns)
     if step.robot is not None:
         placed = rays.remove_robot(placed, *step.robot)
+    return _flag(step._replace(rays=placed), Flag.OUT_OF_RANGE, out_of_range)
+
+
+def drop_stray(step: Step) -> Step:
+    """Leaves out isolated returns: they leave no surface and clear no space."""
+    kept = ~stray.find_stray(step.rays)
+    placed = step.rays._replace(ends=step.rays.ends & kept, in_range=step.rays.in_range & kept)
     return step._replace(rays=placed)
+
+
+def compare_cloud(step: Step) -> Step:
+    """Finds the returns on new things, and clouds that contradict the map as a whole."""
+    found = novelty.compare_cloud(step.config, step.state.grid, step.rays, step.state.updates)
+    contradicts = (step.flags == 0) & ~found.consistent
+    return _flag(step._replace(novelty=found), Flag.INCONSISTENT_CLOUD, contradicts)
 
 
 def calibrate_bound(step: Step) -> Step:
@@ -111,17 +140,28 @@ def calibrate_bound(step: Step) -> Step:
 def read_window(step: Step) -> Step:
     """Reads the evidence within reach of the sensor."""
     window = evidence.read_window(step.config, step.state.grid.evidence, step.rays)
-    return step._replace(window=window)
+    return step._replace(before=window, window=window)
 
 
 def fuse_hits(step: Step) -> Step:
     """Merges the returns into surface patches (IV-B)."""
-    return step._replace(window=patches.fuse_hits(step.config, step.window, step.rays, step.noise))
+    return step._replace(window=patches.fuse_hits(step.config, step.window, step.rays))
 
 
 def trace_rays(step: Step) -> Step:
     """Counts the rays through free voxels and marks hidden ones (IV-B)."""
     return step._replace(window=carving.trace_rays(step.config, step.window, step.rays))
+
+
+def renew_evidence(step: Step) -> Step:
+    """Lets new evidence outweigh old: things that appear, space that they hide, what vanished."""
+    config, before, placed = step.config, step.before, step.rays
+    window, fresh = hiding.add_new_surfaces(config, before, step.window, placed, step.novelty)
+    window = hiding.hide_behind(config, before, window, placed, fresh)
+    window = vanishing.drop_vanished(config, before, window, placed, step.state.updates)
+    if step.robot is not None:
+        window = robot.clear_robot(config, window, *step.robot)
+    return step._replace(window=window)
 
 
 def fade_evidence(step: Step) -> Step:
@@ -176,11 +216,8 @@ def summarize(step: Step) -> Step:
     """Counts the update and writes its report."""
     state, ends, inside = step.state, step.rays.ends, step.rays.inside
     outside = ends & ~inside
-    flags = (
-        state.report.flags
-        | jnp.where(jnp.any(outside), Flag.POINTS_OUTSIDE, 0).astype(jnp.uint32)
-        | jnp.where(step.trained, 0, Flag.TRAINING_FAILED).astype(jnp.uint32)
-    )
+    step = _flag(step, Flag.POINTS_OUTSIDE, jnp.any(outside))
+    step = _flag(step, Flag.TRAINING_FAILED, ~step.trained)
 
     def count(rows: jax.Array) -> jax.Array:
         return jnp.sum(rows, dtype=jnp.int32)
@@ -192,17 +229,23 @@ def summarize(step: Step) -> Step:
         points_invalid=count(~step.finite),
         sdf_loss=step.losses.sdf,
         eikonal_loss=step.losses.eikonal,
-        flags=flags,
+        points_moving=count(step.novelty.novel),
+        refused_in_row=jnp.zeros((), jnp.int32),
+        update_flags=step.flags,
+        flags=state.report.flags | step.flags,
     )
     return step._replace(state=state.replace(updates=state.updates + 1, report=report))
 
 
-STAGES: tuple[Stage, ...] = (
-    place_cloud,
+CHECKS: tuple[Stage, ...] = (place_cloud, drop_stray, compare_cloud)
+"""Stages that decide whether the cloud is fused."""
+
+FUSION: tuple[Stage, ...] = (
     calibrate_bound,
     read_window,
     fuse_hits,
     trace_rays,
+    renew_evidence,
     fade_evidence,
     write_window,
     update_distances,
@@ -212,14 +255,42 @@ STAGES: tuple[Stage, ...] = (
     train,
     summarize,
 )
+"""Stages that fuse it."""
+
+STAGES = CHECKS + FUSION
 
 
-def run_stages(step: Step) -> Step:
-    """Runs all stages, each in a named scope of its own."""
-    for stage in STAGES:
+def run_stages(step: Step, stages: Sequence[Stage]) -> Step:
+    """Runs stages, each in a named scope of its own."""
+    for stage in stages:
         with jax.named_scope(stage.__name__):
             step = stage(step)
     return step
+
+
+def is_accepted(step: Step) -> jax.Array:
+    """Returns whether the checked cloud is to be fused, () bool."""
+    refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE
+    inconsistent = (step.flags & Flag.INCONSISTENT_CLOUD) > 0
+    patient = step.state.report.refused_in_row < step.config.most_refusals
+    return ((step.flags & refused) == 0) & ~(inconsistent & patient)
+
+
+def refuse(state: MapState, step: Step) -> MapState:
+    """Returns the map as it was, with the flags of a checked cloud that is not fused."""
+    report = state.report
+    inconsistent = (step.flags & Flag.INCONSISTENT_CLOUD) > 0
+    return state.replace(
+        report=report.replace(
+            refused_in_row=report.refused_in_row + inconsistent.astype(jnp.int32),
+            update_flags=step.flags,
+            flags=report.flags | step.flags,
+        )
+    )
+
+
+def _flag(step: Step, flag: Flag, raised: jax.Array) -> Step:
+    return step._replace(flags=step.flags | jnp.where(raised, flag, 0).astype(jnp.uint32))
 
 
 def _with_grid(step: Step, grid: Grid) -> Step:

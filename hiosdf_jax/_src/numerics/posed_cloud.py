@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zlib
 from typing import Any
 
@@ -159,6 +160,33 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" copies twice
     padded[count:] = np.nan
     return padded, pose
+
+
+def warn_out_of_range(
+    cloud: np.ndarray, min_range: float, max_range: float, min_share: float
+) -> None:
+    """Warns of a cloud with almost no return in range, and names the likely unit.
+
+    Args:
+        cloud: (N, 3) m, sensor frame; rows with a NaN are no returns.
+        min_range: Least range of a return that counts, m.
+        max_range: Largest range of a return that counts, m.
+        min_share: Least share of the returns that must be in range.
+    """
+    x, y, z = cloud.T.astype(np.float64)  # a finite row must not overflow
+    square = x * x + y * y + z * z
+    square = square[np.isfinite(square)]
+    usable = np.count_nonzero((square >= min_range**2) & (square <= max_range**2))
+    if usable >= min_share * len(square):
+        return
+    middle = float(np.sqrt(np.median(square)))
+    unit = "millimeters" if min_range <= middle / 1000 <= max_range else "m"
+    warnings.warn(
+        f"cloud has {usable} of {len(square)} returns between min_range, {min_range:g} m, and "
+        f"max_range, {max_range:g} m; the median range is {middle:.3g} m. The map ignores it. "
+        + ("It looks like millimeters, expected m" if unit != "m" else "Its unit must be m"),
+        stacklevel=3,
+    )
 
 
 def _check_cloud_shape(cloud: Any) -> None:

@@ -1,0 +1,1 @@
+"""What a cloud contradicts in the map: new things, hidden space, vanished surfaces, bad clouds."""

@@ -1,0 +1,86 @@
+"""Compares a cloud with the map before it is fused: which returns are on something new.
+
+A return is novel if it ends in space that rays had shown to be free, away from all known surfaces
+(the idea of Dynablox: what returns from free space has moved there). A cloud that contradicts the
+map as a whole is a fault of the sensor, of the pose or of the unit, and not news.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.vectors import each, split, take
+from hiosdf_jax._src.state import NO_FEATURE, Grid
+
+# A novel return is this far from every surface, beside three standard deviations of its range.
+_NOVEL_VOXELS = 1.5
+
+# The map can judge a cloud after this many updates, by at least this share of its returns.
+_CONFIDENT_UPDATES = 5
+_LEAST_COMPARABLE = 0.2
+
+# A cloud contradicts the map if more than this share of its comparable returns is novel. On
+# house_depth at most 0.4 % are in a normal frame, and 3 to 29 % in frames that are 1 m off.
+_MOST_NOVEL = 0.5
+
+
+class Novelty(NamedTuple):
+    """A cloud compared with the map before it.
+
+    Attributes:
+        novel: The return is in space that was free, (N,) bool.
+        near_new: The return is on or next to a surface that is itself new, (N,) bool.
+        consistent: The cloud agrees with the map, or the map cannot judge it, () bool.
+    """
+
+    novel: jax.Array
+    near_new: jax.Array
+    consistent: jax.Array
+
+
+def compare_cloud(config: Config, grid: Grid, rays: Rays, updates: jax.Array) -> Novelty:
+    """Compares a cloud with the map so far.
+
+    Args:
+        config: The map's configuration.
+        grid: The grid before the cloud is fused.
+        rays: The cloud.
+        updates: Number of updates of the map, () int32.
+
+    Returns:
+        The comparison.
+    """
+    evidence, derived = grid.evidence, grid.derived
+    shape, size = config.grid_shape, config.voxel_size
+    index, _, _ = geometry.voxel_of(config, rays.points_world)
+    index = split(index)
+    voxel = geometry.flat_index(shape, index)
+    ends = rays.ends & rays.inside
+
+    jump = take(derived.nearest.reshape(-1, 3), voxel)
+    found = jump[0] != NO_FEATURE
+    patch = geometry.flat_index(shape, each(lambda i, j: jnp.where(found, i + j, i), index, jump))
+    change = evidence.change.ravel()
+    near_new = (change[voxel] > 0) | (change[patch] > 0)
+
+    sdf = derived.sdf.ravel()[voxel].astype(jnp.float32)
+    observed = ends & (derived.frontier_steps.ravel()[voxel] > 0)
+    hits, passes = (array.ravel()[voxel] for array in (evidence.hits, evidence.passes))
+    empty = (hits < config.min_hits) | (hits < config.min_hit_ratio * (hits + jnp.abs(passes)))
+    away = sdf > _NOVEL_VOXELS * size + 3 * rays.sigma
+    free = observed & (passes > 0) & (away | near_new)
+    # Space that a new thing has hidden: it has moved there, or this is another side of it.
+    novel = ends & empty & (free | ((passes < 0) & near_new))
+
+    # New things move on: returns near them are expected, and say nothing about the whole cloud.
+    comparable = observed & ~near_new
+    count = jnp.sum(comparable)
+    contradicts = jnp.sum(novel & comparable) > _MOST_NOVEL * count
+    confident = (updates >= _CONFIDENT_UPDATES) & (count >= _LEAST_COMPARABLE * jnp.sum(rays.ends))
+    return Novelty(novel, ends & near_new, ~(confident & contradicts))

@@ -1,0 +1,202 @@
+"""Surfaces that rays look through: they vanish after a few scans, however many hits they have."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.change import directions
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid import geometry, patches
+from hiosdf_jax._src.grid.evidence import EvidenceWindow
+from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split, take
+
+# Patches that one scan can judge; the others are left to later scans.
+_MOST_SUSPECTS = 8192
+
+# Rays count as through a patch within this share of its half extents, and this many voxels at
+# least: its edges are uncertain.
+_INNER_SHARE = 0.7
+_LEAST_HALF_VOXELS = 0.15
+
+# Rays that graze a patch may pass beside it.
+_LEAST_COSINE = 0.2
+
+# A scan counts by the quarters of a patch that its rays cross: 1 for two, such as those of one ring
+# of a LiDAR, 3 for all. A scan of `vanish_scans` is worth this many.
+_DOUBT_PER_SCAN = 2
+
+# `Evidence.change` of a voxel that has just vanished, and where that is forgotten again: until then
+# the network learns such places first.
+_GONE = -72
+_FORGOTTEN = -64
+
+# A patch goes with this many vanished voxels up to two voxels away. Fewer cost accuracy
+# in a world that stands still: with 2 of 26 neighbors, 0.61 instead of 0.59 cm on a LiDAR stream.
+_LEAST_GONE_NEIGHBORS = 8
+_SPREADS = 3  # in one scan
+
+# Hits of a surface that is as sure as it can be; one of fewer hits vanishes sooner.
+_SURE_HITS = 20.0
+
+
+def drop_vanished(
+    config: Config, before: EvidenceWindow, window: EvidenceWindow, rays: Rays, turn: jax.Array
+) -> EvidenceWindow:
+    """Removes patches that several scans in a row have looked through.
+
+    A patch on a new surface is removed by one scan that looks past it: it may have moved on.
+
+    Args:
+        config: The map's configuration.
+        before: The evidence before the cloud.
+        window: The evidence with the cloud's hits and passes.
+        rays: The cloud.
+        turn: Number of the update, () int32.
+
+    Returns:
+        The window; vanished voxels are free.
+    """
+    hit = window.hits > before.hits
+    passed = window.passes > jnp.abs(before.passes)
+    change = jnp.where(hit, jnp.maximum(window.change, 0), window.change)
+    forgetting = passed & (change < _FORGOTTEN)
+    later = jnp.where(change == _FORGOTTEN - 1, 0, change + 1)
+    change = jnp.where(forgetting, later, change)
+    change = change.astype(jnp.int8)
+    window = window._replace(change=change)
+    suspects = (window.hits > 0) & ~hit & (passed | (change > 0))
+    voxels = suspects.size
+    # Of too many, other slices of the window in each scan, so that none waits forever.
+    slices = 1 + jnp.sum(suspects) // _MOST_SUSPECTS
+    slice_of = jnp.arange(suspects.shape[0], dtype=jnp.int32)[:, None, None]
+    suspects &= (slice_of + turn) % slices == 0
+    (voxel,) = jnp.nonzero(suspects.ravel(), size=_MOST_SUSPECTS, fill_value=voxels)
+    row = jnp.minimum(voxel, voxels - 1)
+
+    quarters, looked_past = _look(config, window, rays, row)
+    old = change.ravel()[row].astype(jnp.int32)
+    hits = window.hits.ravel()[row]
+    doubt = jnp.where(old > 0, 0, -old) + jnp.maximum(quarters - 1, 0)
+    needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
+    vanished = ((quarters > 1) & (doubt >= needed)) | ((old > 0) & looked_past)
+    counted = jnp.where(old > 0, old, -jnp.minimum(doubt, -_FORGOTTEN))
+
+    def put(array: jax.Array, values: jax.Array) -> jax.Array:
+        values = jnp.broadcast_to(values, voxel.shape).astype(array.dtype)
+        return array.ravel().at[voxel].set(values, mode="drop").reshape(array.shape)
+
+    # What is left of a thing goes with it: edges that few rays meet.
+    for _ in range(_SPREADS):
+        change = put(change, jnp.where(vanished, _GONE, counted))
+        remains = _gone_neighbors(change, row) >= _LEAST_GONE_NEIGHBORS
+        vanished |= remains & ((quarters > 1) | looked_past)
+
+    def clear(array: jax.Array) -> jax.Array:
+        return put(array, jnp.where(vanished, 0, array.ravel()[row]))
+
+    passes = window.passes.ravel()[row]
+    return window._replace(
+        hits=clear(window.hits),
+        weight=clear(window.weight),
+        behind=clear(window.behind),
+        passes=put(window.passes, jnp.where(vanished, jnp.maximum(jnp.abs(passes), 1), passes)),
+        change=put(change, jnp.where(vanished, _GONE, counted)),
+    )
+
+
+def _gone_neighbors(change: jax.Array, row: jax.Array) -> jax.Array:
+    """Counts the vanished voxels up to two voxels from each row of the raveled window."""
+    steps = np.stack(np.meshgrid(*3 * [[-2, -1, 0, 1, 2]], indexing="ij"), axis=-1).reshape(-1, 3)
+    index = jnp.stack(jnp.unravel_index(row, change.shape), axis=-1)[:, None] + steps
+    inside = jnp.all((index >= 0) & (index < jnp.asarray(change.shape)), axis=-1)
+    around = geometry.flat_index(change.shape, split(jnp.where(inside[..., None], index, 0)))
+    return jnp.sum(inside & (change.ravel()[around] < _FORGOTTEN), axis=1)
+
+
+def is_recent(change: jax.Array) -> jax.Array:
+    """Returns a mask of the voxels where a surface appeared or vanished in the last scans.
+
+    Args:
+        change: As in `Evidence`, (...).
+
+    Returns:
+        (...) bool.
+    """
+    return (change > 0) | (change < _FORGOTTEN)
+
+
+def _look(
+    config: Config, window: EvidenceWindow, rays: Rays, row: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Counts the quarters of patches that rays cross, and finds those that all rays see past."""
+    size, shape = config.voxel_size, window.hits.shape
+    index = jnp.stack(jnp.unravel_index(row, shape), axis=-1)
+    mean = take(window.mean.reshape(-1, 3), row)
+    center_world = split(geometry.voxel_center(config, window.start + index))
+    sensor_world = split(rays.sensor_world)
+    offset = each(lambda c, m, s: c + m * size - s, center_world, mean, sensor_world)
+    distance = length(offset)
+    image = directions.range_image(rays, rays.in_range)
+    filled = directions.fill_gaps(image)
+    pixel = directions.pixel_of(offset)
+    past = (filled.farthest[pixel] > distance + size) & (
+        filled.nearest[pixel] > distance + 0.5 * size
+    )
+
+    axes = window.axes.reshape(-1, 9)
+    long, middle, short = (take(axes, row, first) for first in (0, 3, 6))
+    # A flat patch is a rectangle. Of others, the rectangle faces the sensor.
+    flat = length(short) < 0.5 * length(middle)
+    unit_long = _unit(long)
+    away = _unit(offset)
+    along = dot(away, unit_long)
+    facing = _unit(each(lambda a, u: a - along * u, away, unit_long))
+    normal = each(lambda s, f: jnp.where(flat, s, f), _unit(short), facing)
+    across = _cross(normal, unit_long)
+    least = _LEAST_HALF_VOXELS * size
+
+    def half(deviation: jax.Array) -> jax.Array:
+        extent = patches.EXTENT_DEVIATIONS * deviation * size
+        return jnp.maximum(_INNER_SHARE * extent, least)
+
+    half_long, half_across = half(length(long)), half(length(middle))
+
+    ray = image.row[directions.neighbor_pixels(offset)]
+    known = ray >= 0
+    direction = take(rays.directions_world, jnp.maximum(ray, 0))
+    reach = rays.free_ranges[jnp.maximum(ray, 0)]
+    sigma = rays.sigma[jnp.maximum(ray, 0)]
+
+    def wide(vector: Vector) -> Vector:
+        return each(lambda v: v[..., None], vector)
+
+    cosine = dot(direction, wide(normal))
+    steep = jnp.abs(cosine) >= _LEAST_COSINE
+    depth = dot(wide(offset), wide(normal)) / jnp.where(steep, cosine, 1)
+    beyond = steep & known & (depth > 0) & (reach > depth + size + 3 * sigma)
+    point = each(lambda d, o: d * depth - o, direction, wide(offset))
+    u = dot(point, wide(unit_long)) / half_long[..., None]
+    v = dot(point, wide(across)) / half_across[..., None]
+    crosses = beyond & (jnp.abs(u) < 1) & (jnp.abs(v) < 1)
+    quarters = jnp.zeros(row.shape, jnp.int32)
+    for left in (False, True):
+        for low in (False, True):
+            met = crosses & ((u < 0) == left) & ((v < 0) == low)
+            quarters += jnp.any(met, axis=-1)
+    return quarters, past
+
+
+def _unit(vector: Vector) -> Vector:
+    norm = jnp.maximum(length(vector), 1e-6)
+    return each(lambda v: v / norm, vector)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )

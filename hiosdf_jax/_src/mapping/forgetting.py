@@ -1,0 +1,62 @@
+"""Forgets what a map knows of a box, for changes that the user knows of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid.distance import recompute_distances
+from hiosdf_jax._src.grid.evidence import empty_grid
+from hiosdf_jax._src.grid.frontier import recompute_frontier
+from hiosdf_jax._src.state import Evidence, Grid, MapState
+
+
+def forget(state: MapState, box: Any) -> MapState:
+    """Makes the inside of a box unobserved, as before its first cloud.
+
+    For a change that is known before a sensor sees it: a door that was opened, a pallet that was
+    taken away. Distances, frontier and lower bounds follow at once, the network with the next
+    updates.
+
+    Args:
+        state: The map. Not inside jit.
+        box: ((x0, y0, z0), (x1, y1, z1)) m, world frame. Voxels whose centers lie in it are
+            forgotten; it may reach beyond the bounds.
+
+    Returns:
+        The map without this knowledge. It shares memory with the old map.
+
+    Raises:
+        ValueError: `state` is not a map, or `box` is not two finite, ascending corners.
+
+    Example:
+        >>> state = hio.forget(state, ((1.0, 0.0, 0.0), (2.0, 0.2, 2.1)))
+    """
+    if not isinstance(state, MapState):
+        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    try:
+        corners = np.asarray(box, np.float32)
+    except (TypeError, ValueError):
+        corners = np.zeros(0)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
+        raise ValueError(f"box is {box!r}, expected ((x0, y0, z0), (x1, y1, z1)), ascending")
+    return state.replace(grid=_forget(state.config, state.grid, corners))
+
+
+@jax.jit(static_argnums=0)
+def _forget(config: Config, grid: Grid, corners: jax.Array) -> Grid:
+    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, config.grid_shape), indexing="ij"), axis=-1)
+    center_world = geometry.voxel_center(config, index)
+    inside = jnp.all((center_world >= corners[0]) & (center_world <= corners[1]), axis=-1)
+
+    def clear(known: jax.Array, empty: jax.Array) -> jax.Array:
+        return jnp.where(inside.reshape(*inside.shape, *[1] * (known.ndim - 3)), empty, known)
+
+    evidence: Evidence = jax.tree.map(clear, grid.evidence, empty_grid(config).evidence)
+    grid = grid.replace(evidence=evidence)
+    return recompute_frontier(config, recompute_distances(config, grid))

@@ -1,0 +1,69 @@
+"""Stray returns against a count over all returns of their cells."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from voxels import rays_to
+
+from hiosdf_jax._src.change import directions, stray
+from hiosdf_jax._src.numerics.vectors import split
+
+find_stray = jax.jit(stray.find_stray)
+pixel_of = jax.jit(lambda offset: directions.pixel_of(split(offset)))
+
+SENSOR = np.array([0.5, -0.25, 0.125])
+
+
+def camera(count, ranges, seed=0):
+    """Rays in a cone of 10 degrees to each side."""
+    rng = np.random.default_rng(seed)
+    ahead = np.stack([np.ones(count), *rng.uniform(-0.18, 0.18, (2, count))], axis=1)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    return rays_to(SENSOR + ahead * np.reshape(ranges, (-1, 1)), SENSOR)
+
+
+def stray_by_a_loop(rays):
+    """The definition: in 4 x 4 pixels, fewer than 3 others, or 3 %, within about 6 % in range."""
+    line, column = np.divmod(np.asarray(pixel_of(rays.directions_world)), 256)
+    cell = (line // 4) * 64 + column // 4
+    in_range = np.asarray(rays.in_range)
+    part = np.floor(16 * np.log(np.asarray(rays.free_ranges, np.float64) / 0.02))
+    result = np.zeros(len(cell), bool)
+    for k in np.flatnonzero(in_range):
+        here = in_range & (cell == cell[k])
+        others = np.sum(here & (np.abs(part - part[k]) <= 1)) - 1
+        result[k] = here.sum() >= 40 and others < max(3, 0.03 * here.sum())
+    return result
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_stray_returns_against_a_loop(seed):
+    rng = np.random.default_rng(seed)
+    ranges = np.where(rng.random(6000) < 0.05, rng.uniform(0.1, 3, 6000), 2 + rng.random(6000) / 50)
+    rays = camera(6000, ranges, 100 + seed)
+    rays = rays._replace(in_range=jnp.asarray(rng.random(6000) < 0.9))
+    found, expected = np.asarray(find_stray(rays)), stray_by_a_loop(rays)
+    assert 50 < expected.sum() < 400
+    # Rounding may put a range into the next bin.
+    assert np.mean(found != expected) < 1e-3
+    assert not found[~np.asarray(rays.in_range)].any()
+
+
+def test_outliers_of_a_dense_cloud_are_stray_and_thin_things_are_not():
+    ranges = np.full(6000, 2.0)
+    ranges[:30] = np.linspace(0.4, 1.4, 30)  # each on its own
+    rays = camera(6000, ranges)
+    wire = np.abs(np.asarray(rays.directions_world)[:, 1]) < 0.004  # 0.5 degrees wide
+    wire[:30] = False
+    thin = camera(6000, np.where(wire, 1.0, ranges))
+    assert 80 < wire.sum() < 200
+    found = np.asarray(find_stray(thin))
+    assert found[:30].mean() > 0.8
+    assert not found[30:][~wire[30:]].any()
+    assert found[wire].mean() < 0.1
+
+
+def test_a_sparse_cloud_has_no_stray_returns():
+    rng = np.random.default_rng(1)
+    assert not np.asarray(find_stray(camera(300, rng.uniform(0.2, 3, 300)))).any()

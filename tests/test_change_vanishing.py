@@ -1,0 +1,215 @@
+"""Patches that rays look through vanish after some scans; others stay as they are."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import arrays_equal
+from voxels import CONFIG, SHAPE, empty_window, fuse, fuse_hits, rays_to, trace_rays
+
+from hiosdf_jax._src.change import vanishing
+
+SENSOR = np.array([-0.25, 0.55, 0.65])
+CELL = (6, 5, 4)  # its center is (0.35, 0.55, 0.65)
+CENTER = np.array([0.35, 0.55, 0.65])
+WALL = 0.87  # x of the wall behind
+
+drop = jax.jit(vanishing.drop_vanished, static_argnums=0)
+
+
+def square(half, count=21):
+    """Offsets (y, z) on a square grid."""
+    line = np.linspace(-half, half, count)
+    return np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+@functools.cache
+def patch(columns=10, lines=10):
+    """One patch of 9 by 7 cm in the plane of its voxel's center; its axes are y and z."""
+    y, z = np.linspace(-0.045, 0.045, columns), np.linspace(-0.035, 0.035, lines)
+    offsets = np.stack(np.meshgrid([0.0], y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    hits = columns * lines
+    points = np.resize(CENTER + offsets, (600, 3)).astype(np.float32)
+    window = fuse(empty_window(), points, SENSOR, hit=np.arange(600) < hits)
+    assert float(window.hits[CELL]) == hits
+    return window
+
+
+def through(offsets):
+    """Ends on the wall of rays that cross the patch's plane at offsets (y, z) from its center."""
+    aim = CENTER + np.concatenate([np.zeros((len(offsets), 1)), offsets], axis=1)
+    return SENSOR + (aim - SENSOR) * ((WALL - SENSOR[0]) / (CENTER[0] - SENSOR[0]))
+
+
+def rays_of(ends):
+    """Rays to up to 600 ends; other rows are no returns."""
+    real = np.arange(600) < len(ends)
+    rays = rays_to(np.resize(ends, (600, 3)).astype(np.float32), SENSOR, hit=real)
+    return rays._replace(in_range=jnp.asarray(real))
+
+
+def scan(window, ends, config=CONFIG):
+    """The window after a cloud, and the one before patches vanish."""
+    rays = rays_of(ends)
+    after = trace_rays(CONFIG, fuse_hits(CONFIG, window, rays), rays)
+    return drop(config, window, after, rays, 0), after
+
+
+def state_of(window):
+    return float(window.hits[CELL]), int(window.change[CELL])
+
+
+def scans_until_gone(window, ends, config=CONFIG, most=400):
+    """How many scans it takes until the patch has vanished."""
+    for count in range(1, most + 1):
+        window, _ = scan(window, ends, config)
+        if float(window.hits[CELL]) == 0:
+            return count
+    return None
+
+
+ALL = square(0.028)
+ASIDE = np.add(ALL, [0.3, 0.2])
+QUARTERS = {
+    "all": (ALL, 3),
+    "three": (ALL[(ALL[:, 0] < 0) | (ALL[:, 1] < 0)], 2),
+    "two": (ALL[ALL[:, 0] < -0.001], 1),
+}
+
+
+@pytest.mark.parametrize("name", QUARTERS)
+@pytest.mark.parametrize("scans", [3, 6])
+def test_a_patch_that_rays_cross_vanishes_after_some_scans(name, scans):
+    """A scan of `vanish_scans` is one that crosses three quarters; all count more, two less."""
+    offsets, doubt = QUARTERS[name]
+    config = dataclasses.replace(CONFIG, vanish_scans=scans)
+    window = patch()
+    needed = -(-2 * scans // doubt)
+    for k in range(1, needed):
+        window, _ = scan(window, through(offsets), config)
+        assert state_of(window) == (100, -k * doubt)
+    gone, after = scan(window, through(offsets), config)
+    assert state_of(gone) == (0, -72)
+    assert float(gone.weight[CELL]) == float(gone.behind[CELL]) == 0
+    assert float(gone.passes[CELL]) >= 1
+    others = np.ones(SHAPE, bool)
+    others[CELL] = False
+    for field, expected in zip(gone, after, strict=True):
+        if expected.ndim >= 3:
+            np.testing.assert_array_equal(np.asarray(field)[others], np.asarray(expected)[others])
+
+
+def test_a_patch_vanishes_even_after_the_most_scans_that_can_be_asked_for():
+    config = dataclasses.replace(CONFIG, vanish_scans=30)
+    count = scans_until_gone(patch(), through(ALL), config, most=100)
+    assert count == 20  # a scan through all quarters is worth 3, and 60 are needed
+
+
+def test_rays_beside_a_patch_leave_it():
+    """The patch is half as wide as its voxel; rays pass through the other half of the voxel."""
+    rng = np.random.default_rng(1)
+    offsets = rng.uniform(-0.049, 0.049, (300, 2)) * [0.4, 1] - [0.025, 0]
+    points = CENTER + np.concatenate([np.zeros((300, 1)), offsets], axis=1)
+    points = np.resize(points, (600, 3)).astype(np.float32)
+    window = fuse(empty_window(), points, SENSOR, hit=np.arange(600) < 300)
+    beside = np.add(square(0.02), [0.026, 0])
+    for _ in range(12):
+        window, after = scan(window, through(beside))
+    assert float(after.passes[CELL]) > 100
+    assert state_of(window) == (300, 0)
+    gone = scans_until_gone(window, through(square(0.012) - [0.025, 0]))
+    assert gone == 2
+
+
+def test_rays_through_one_quarter_or_none_leave_a_patch():
+    one = ALL[(ALL[:, 0] > 0.001) & (ALL[:, 1] > 0.001)]
+    for offsets in (one, np.add(square(0.02), [0, 0.065])):
+        window = patch()
+        for _ in range(8):
+            window, _ = scan(window, through(offsets))
+        assert state_of(window) == (100, 0)
+
+
+def test_rays_that_end_near_a_patch_do_not_look_through_it():
+    """Noise moves ends behind a surface: by up to a voxel and three standard deviations."""
+    for beyond, gone in ((0.05, None), (0.09, None), (0.25, 2)):
+        ends = through(ALL)
+        ahead = ends - SENSOR
+        at_patch = (CENTER[0] - SENSOR[0]) / ahead[:, :1]
+        unit = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+        ends = SENSOR + at_patch * ahead + beyond * unit
+        # Other rays make the voxel a suspect.
+        ends = np.concatenate([ends, through(np.add(square(0.004, 3), [0, 0.046]))])
+        assert scans_until_gone(patch(), ends, most=8) == gone
+
+
+def test_a_hit_resets_the_count():
+    window, _ = scan(patch(), through(ALL))
+    assert state_of(window) == (100, -3)
+    again, _ = scan(window, np.concatenate([through(ALL), CENTER[None]]))
+    assert state_of(again) == (101, 0)
+    later, _ = scan(again, through(ALL))
+    assert state_of(later) == (101, -3)
+    # A scan that does not look there changes nothing.
+    elsewhere, _ = scan(window, through(ASIDE))
+    assert state_of(elsewhere) == (100, -3)
+
+
+def test_patches_of_few_hits_vanish_sooner():
+    config = dataclasses.replace(CONFIG, vanish_scans=6)
+    patches = [patch(3, 2), patch(5, 2), patch(5, 4), patch()]  # 6, 10, 20 and 100 hits
+    # 2 ceil(6 hits / 20), at most 12, of which a scan is worth 3 or, with two quarters, 1
+    assert [scans_until_gone(each, through(ALL), config) for each in patches] == [2, 2, 4, 4]
+    two = through(QUARTERS["two"][0])
+    assert [scans_until_gone(each, two, config) for each in patches] == [4, 6, 12, 12]
+
+
+def test_new_surfaces_vanish_at_once():
+    for quarters, gone in (("two", True), ("all", True)):
+        new = patch()._replace(change=jnp.zeros(SHAPE, jnp.int8).at[CELL].set(5))
+        after, _ = scan(new, through(QUARTERS[quarters][0]))
+        assert (state_of(after) == (0, -72)) == gone
+    # Not where no ray looks, and not where something stands before it.
+    for ends in (through(ASIDE), CENTER - [0.2, 0, 0] + 0.001 * through(ALL)):
+        kept, _ = scan(new, ends)
+        assert state_of(kept) == (100, 5)
+
+
+def test_vanished_places_are_forgotten_after_eight_scans_that_pass_them():
+    window = patch()
+    for _ in range(2):
+        window, _ = scan(window, through(ALL))
+    seen = []
+    for _ in range(9):
+        seen.append(int(window.change[CELL]))
+        assert bool(vanishing.is_recent(window.change)[CELL]) == (seen[-1] != 0)
+        window, _ = scan(window, through(ALL))
+        elsewhere, _ = scan(window, through(ASIDE))
+        assert int(elsewhere.change[CELL]) == int(window.change[CELL])
+    assert seen == [-72, -71, -70, -69, -68, -67, -66, -65, 0]
+    old = jnp.asarray([8, 1, 0, -1, -64, -65, -72], jnp.int8)
+    expected = [True, True, False, False, False, True, True]
+    np.testing.assert_array_equal(vanishing.is_recent(old), expected)
+
+
+def test_rays_that_are_not_in_range_change_nothing():
+    rays = rays_of(through(ALL))._replace(in_range=jnp.zeros(600, bool))
+    window = patch()._replace(change=jnp.zeros(SHAPE, jnp.int8).at[CELL].set(5))
+    assert arrays_equal(drop(CONFIG, window, window, rays, 0), window)
+
+
+@pytest.mark.parametrize("at_border", [False, True])
+def test_vanished_neighbors_against_a_loop(at_border):
+    rng = np.random.default_rng(0)
+    change = np.where(rng.random(SHAPE) < 0.5, rng.integers(-72, 9, SHAPE), 0).astype(np.int8)
+    every = np.stack(np.indices(SHAPE), axis=-1).reshape(-1, 3)
+    inner = np.all((every >= 2) & (every < np.subtract(SHAPE, 2)), axis=1)
+    rows = np.flatnonzero(inner != at_border)
+    found = jax.jit(vanishing._gone_neighbors)(jnp.asarray(change), jnp.asarray(rows))
+    cells = np.argwhere(change < -64)
+    expected = [np.sum(np.abs(cells - every[row]).max(axis=1) <= 2) for row in rows]
+    assert max(expected) > 4
+    np.testing.assert_array_equal(found, expected)
