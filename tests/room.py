@@ -81,3 +81,16 @@ def arrays_equal(a, b):
     return all(
         np.array_equal(x, y, equal_nan=True) for x, y in zip(plain(a), plain(b), strict=True)
     )
+
+
+def check_snapshot_outlives_its_map(state, donate):
+    """Checks that a snapshot answers as before once an update has taken its map's memory."""
+    cloud, pose = (jnp.asarray(array) for array in stream(1)[0])
+    state = hio.update(state, cloud, pose)
+    field = hio.snapshot(state)
+    points = np.zeros((3, 3))
+    before = hio.query(field, points)
+    assert arrays_equal(before, hio.query(state, points))
+    donate(state, cloud, pose)
+    assert arrays_equal(hio.query(field, points), before)
+    assert int(field.updates) == 1

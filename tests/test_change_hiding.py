@@ -1,12 +1,14 @@
 """New surfaces outweigh old passes and hide what is behind them, against geometry and loops."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from voxels import CONFIG, SHAPE, empty_window, fuse_hits, rays_to, trace_rays, uniform
 
-from hiosdf_jax._src.change import hiding
+from hiosdf_jax._src.change import directions, hiding
 from hiosdf_jax._src.change.novelty import Novelty
 from hiosdf_jax._src.grid.evidence import is_observed
 
@@ -15,7 +17,11 @@ PLATE = np.array([0.18, 0.42, 0.53]), np.array([0.18, 0.63, 0.70])  # opposite c
 WALL = 0.87  # x of the far wall
 
 add_new = jax.jit(hiding.add_new_surfaces, static_argnums=0)
-hide = jax.jit(hiding.hide_behind, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def hide(config, before, window, rays, fresh):
+    return hiding.hide_behind(config, before, window, rays, directions.view_of(rays), fresh)
 
 
 def centers():

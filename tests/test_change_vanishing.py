@@ -10,14 +10,18 @@ import pytest
 from room import arrays_equal
 from voxels import CONFIG, SHAPE, empty_window, fuse, fuse_hits, rays_to, trace_rays
 
-from hiosdf_jax._src.change import vanishing
+from hiosdf_jax._src.change import directions, vanishing
 
 SENSOR = np.array([-0.25, 0.55, 0.65])
 CELL = (6, 5, 4)  # its center is (0.35, 0.55, 0.65)
 CENTER = np.array([0.35, 0.55, 0.65])
 WALL = 0.87  # x of the wall behind
 
-drop = jax.jit(vanishing.drop_vanished, static_argnums=0)
+
+@functools.partial(jax.jit, static_argnums=0)
+def drop(config, before, window, rays, turn):
+    view = directions.view_of(rays)
+    return vanishing.drop_vanished(config, before, window, rays, view, turn)
 
 
 def square(half, count=21):
@@ -208,7 +212,8 @@ def test_vanished_neighbors_against_a_loop(at_border):
     every = np.stack(np.indices(SHAPE), axis=-1).reshape(-1, 3)
     inner = np.all((every >= 2) & (every < np.subtract(SHAPE, 2)), axis=1)
     rows = np.flatnonzero(inner != at_border)
-    found = jax.jit(vanishing._gone_neighbors)(jnp.asarray(change), jnp.asarray(rows))
+    around, inside = jax.jit(vanishing._around, static_argnums=0)(SHAPE, jnp.asarray(rows))
+    found = np.sum(np.asarray(inside) & (change.ravel() < -64)[np.asarray(around)], axis=1)
     cells = np.argwhere(change < -64)
     expected = [np.sum(np.abs(cells - every[row]).max(axis=1) <= 2) for row in rows]
     assert max(expected) > 4

@@ -13,7 +13,7 @@ Bounds = tuple[Point, Point]
 # Bounds that are multiples of the voxel size must not gain a voxel from rounding (0.3 / 0.1 < 3).
 _TOLERANCE_VOXELS = 1e-4
 
-# An int32 counts the nine numbers of each voxel's principal axes. Such a map has 9.5 GB.
+# An int32 counts the nine numbers of each voxel's principal axes. Such a map has 9.8 GB.
 _MOST_VOXELS = (2**31 - 1) // 9
 
 
@@ -52,8 +52,9 @@ class Config:
             hits / (hits + passes); smaller patches need less, by their area.
         evidence_limit: Rays that a voxel remembers; older evidence fades beyond that.
         vanish_scans: Scans that must look through most of a surface patch, without a hit between
-            them, before it vanishes. Patches of few hits need fewer scans; so do scans with rays
-            through all of it. Scans with rays through half of it, as of one LiDAR ring, count half.
+            them, before it vanishes. Patches of few hits need fewer scans. A scan with rays through
+            all of a patch counts 1.5 times, a scan with rays through half of it (one ring of a
+            LiDAR) 0.5 times.
         distance_horizon: Largest distance to a patch that the grid resolves, m; <= 127 voxels.
         frontier_horizon: Largest distance to unseen space that the grid resolves, m.
 

@@ -252,6 +252,12 @@ class Query(NamedTuple):
     lower: jax.Array
 
 
+def check_map(state: Any) -> None:
+    """Raises a ValueError if an argument named `state` is not a map."""
+    if not isinstance(state, MapState):
+        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+
+
 def surface_of(grid: Grid) -> Surface:
     """Selects what queries read of a grid, without a copy."""
     return Surface(mean=grid.evidence.mean, axes=grid.evidence.axes, derived=grid.derived)

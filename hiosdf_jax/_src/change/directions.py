@@ -101,6 +101,24 @@ def range_image(rays: Rays, chosen: jax.Array) -> RangeImage:
     return RangeImage(nearest, farthest, row)
 
 
+class View(NamedTuple):
+    """A cloud as seen from its sensor.
+
+    Attributes:
+        measured: Pixels in which rays ended.
+        filled: The same, with pixels between rays filled.
+    """
+
+    measured: RangeImage
+    filled: RangeImage
+
+
+def view_of(rays: Rays) -> View:
+    """Makes the images of a cloud."""
+    measured = range_image(rays, rays.in_range)
+    return View(measured, fill_gaps(measured))
+
+
 def fill_gaps(image: RangeImage) -> RangeImage:
     """Fills pixels between rays with the nearest and the farthest range around them."""
     nearest, farthest = (array.reshape(EDGE, EDGE) for array in (image.nearest, image.farthest))
@@ -146,30 +164,18 @@ def dense_parts(rays: Rays, chosen: jax.Array) -> jax.Array:
 
     def count(rows: jax.Array) -> jax.Array:
         image = jnp.zeros(EDGE**2, jnp.float32).at[pixel].add(rows.astype(jnp.float32), mode="drop")
-        return _pool_separably(image.reshape(EDGE, EDGE), 0.0, jax.lax.add)
+        return _pool(image.reshape(EDGE, EDGE), 0.0, jax.lax.add, _DENSE_PIXELS)
 
     dense = count(chosen) > _DENSE_SHARE * count(jnp.ones_like(chosen))
-    return _pool_separably(dense.astype(jnp.float32), 0.0, jax.lax.max).ravel() > 0
-
-
-def _pool_separably(
-    values: jax.Array, start: float, function: Callable[..., jax.Array]
-) -> jax.Array:
-    edge = 2 * _DENSE_PIXELS + 1
-    for shape in ((edge, 1), (1, edge)):
-        values = _reduce(values, start, function, shape)
-    return values
+    return _pool(dense.astype(jnp.float32), 0.0, jax.lax.max, _DENSE_PIXELS).ravel() > 0
 
 
 def _pool(
     values: jax.Array, start: float, function: Callable[..., jax.Array], reach: int
 ) -> jax.Array:
-    edge = 2 * reach + 1
-    return _reduce(values, start, function, (edge, edge))
-
-
-def _reduce(
-    values: jax.Array, start: float, function: Callable[..., jax.Array], shape: tuple[int, int]
-) -> jax.Array:
+    """Reduces the square around each pixel, first along columns and then along lines."""
     first = np.asarray(start, values.dtype)  # a float64 under jax_enable_x64 otherwise
-    return jax.lax.reduce_window(values, first, function, shape, (1, 1), "SAME")
+    edge = 2 * reach + 1
+    for shape in ((edge, 1), (1, edge)):
+        values = jax.lax.reduce_window(values, first, function, shape, (1, 1), "SAME")
+    return values

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.change import directions
+from hiosdf_jax._src.change.directions import View
 from hiosdf_jax._src.change.novelty import Novelty
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
@@ -69,7 +70,12 @@ def add_new_surfaces(
 
 
 def hide_behind(
-    config: Config, before: EvidenceWindow, window: EvidenceWindow, rays: Rays, fresh: jax.Array
+    config: Config,
+    before: EvidenceWindow,
+    window: EvidenceWindow,
+    rays: Rays,
+    view: View,
+    fresh: jax.Array,
 ) -> EvidenceWindow:
     """Takes voxels behind new surfaces for unobserved, and shows them again when rays can see them.
 
@@ -78,6 +84,7 @@ def hide_behind(
         before: The evidence before the cloud.
         window: The evidence with the cloud's hits and passes.
         rays: The cloud.
+        view: The cloud as seen from the sensor.
         fresh: The ray ends on a new surface, (N,) bool.
 
     Returns:
@@ -86,24 +93,23 @@ def hide_behind(
 
     def hide(window: EvidenceWindow) -> jax.Array:
         size = config.voxel_size
-        measured = directions.range_image(rays, rays.in_range)
+        measured, filled = view
         fresh_image = directions.range_image(rays, fresh)
         # Thin things hide little, and the image is too coarse to say what.
         solid = directions.dense_parts(rays, fresh)
         nearest = jnp.where(solid, fresh_image.nearest, jnp.inf)
         new = directions.spread_nearest(fresh_image._replace(nearest=nearest), measured)
-        filled = directions.fill_gaps(measured)
-        shape = window.hits.shape
-        index = jnp.stack(jnp.unravel_index(jnp.arange(window.hits.size), shape), axis=-1)
-        offset = split(geometry.voxel_center(config, window.start + index) - rays.sensor_world)
+        # Between rays that look past it, nothing says that a voxel is hidden.
+        unsure = jnp.where(measured.farthest >= 0, -jnp.inf, filled.farthest)
+        seen_past = jnp.where(jnp.isfinite(filled.nearest), filled.nearest, -jnp.inf)
+
+        voxels = jnp.meshgrid(*map(jnp.arange, window.hits.shape), indexing="ij")
+        index = window.start + jnp.stack(voxels, axis=-1)
+        offset = split(geometry.voxel_center(config, index) - rays.sensor_world)
         distance, pixel = length(offset), directions.pixel_of(offset)
         behind = (new[pixel] < distance - 0.5 * size) & (new[pixel] > distance - _HIDES_M)
-        # Between rays that look past it, nothing says that a voxel is hidden.
-        sure = (measured.farthest[pixel] >= 0) | (filled.farthest[pixel] < distance - 0.5 * size)
-        shown = (filled.nearest[pixel] > distance + 0.5 * size) & jnp.isfinite(
-            filled.nearest[pixel]
-        )
-        behind, sure, shown = (mask.reshape(shape) for mask in (behind, sure, shown))
+        sure = unsure[pixel] < distance - 0.5 * size
+        shown = seen_past[pixel] > distance + 0.5 * size
         # Neither passed nor hit by this cloud.
         unmet = (window.passes == before.passes) & (window.hits == before.hits)
         hidden = unmet & behind & sure & is_observed(window.passes, window.hits)

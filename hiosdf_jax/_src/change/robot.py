@@ -8,7 +8,7 @@ import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.grid.evidence import EvidenceWindow
+from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.numerics.vectors import each, length, split, take
 
 # Samples across a sphere; they meet every voxel of spheres up to five voxels in radius.
@@ -47,14 +47,4 @@ def clear_robot(
     ghost = mapped & (length(offset) < radii[:, None])
     target = jnp.where(ghost, voxel, window.hits.size).ravel()
 
-    def put(array: jax.Array, value: float) -> jax.Array:
-        return array.ravel().at[target].set(value, mode="drop").reshape(array.shape)
-
-    free = put(jnp.zeros(window.hits.size, jnp.float32), 1).reshape(shape)
-    return window._replace(
-        hits=put(window.hits, 0),
-        weight=put(window.weight, 0),
-        behind=put(window.behind, 0),
-        change=put(window.change, 0),
-        passes=jnp.where(free > 0, jnp.maximum(jnp.abs(window.passes), 1), window.passes),
-    )
+    return clear_patches(window, target, 0)

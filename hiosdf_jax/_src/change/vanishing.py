@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.change import directions
+from hiosdf_jax._src.change.directions import View
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.grid.evidence import EvidenceWindow
+from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split, take
+from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
 
 # Patches that one scan can judge; the others are left to later scans.
 _MOST_SUSPECTS = 8192
@@ -43,9 +44,14 @@ _SURE_HITS = 20.0
 
 
 def drop_vanished(
-    config: Config, before: EvidenceWindow, window: EvidenceWindow, rays: Rays, turn: jax.Array
+    config: Config,
+    before: EvidenceWindow,
+    window: EvidenceWindow,
+    rays: Rays,
+    view: View,
+    turn: jax.Array,
 ) -> EvidenceWindow:
-    """Removes patches that several scans in a row have looked through.
+    """Removes patches that several scans have looked through since a ray last ended on them.
 
     A patch on a new surface is removed by one scan that looks past it: it may have moved on.
 
@@ -54,6 +60,7 @@ def drop_vanished(
         before: The evidence before the cloud.
         window: The evidence with the cloud's hits and passes.
         rays: The cloud.
+        view: The cloud as seen from the sensor.
         turn: Number of the update, () int32.
 
     Returns:
@@ -69,14 +76,14 @@ def drop_vanished(
     window = window._replace(change=change)
     suspects = (window.hits > 0) & ~hit & (passed | (change > 0))
     voxels = suspects.size
-    # Of too many, other slices of the window in each scan, so that none waits forever.
+    # Where there are too many, each scan judges other slices of the window: none waits forever.
     slices = 1 + jnp.sum(suspects) // _MOST_SUSPECTS
     slice_of = jnp.arange(suspects.shape[0], dtype=jnp.int32)[:, None, None]
     suspects &= (slice_of + turn) % slices == 0
     (voxel,) = jnp.nonzero(suspects.ravel(), size=_MOST_SUSPECTS, fill_value=voxels)
     row = jnp.minimum(voxel, voxels - 1)
 
-    quarters, looked_past = _look(config, window, rays, row)
+    quarters, looked_past = _look(config, window, rays, view, row)
     old = change.ravel()[row].astype(jnp.int32)
     hits = window.hits.ravel()[row]
     doubt = jnp.where(old > 0, 0, -old) + jnp.maximum(quarters - 1, 0)
@@ -88,32 +95,29 @@ def drop_vanished(
         values = jnp.broadcast_to(values, voxel.shape).astype(array.dtype)
         return array.ravel().at[voxel].set(values, mode="drop").reshape(array.shape)
 
-    # What is left of a thing goes with it: edges that few rays meet.
-    for _ in range(_SPREADS):
-        change = put(change, jnp.where(vanished, _GONE, counted))
-        remains = _gone_neighbors(change, row) >= _LEAST_GONE_NEIGHBORS
-        vanished |= remains & ((quarters > 1) | looked_past)
+    change = put(change, jnp.where(vanished, _GONE, counted))
 
-    def clear(array: jax.Array) -> jax.Array:
-        return put(array, jnp.where(vanished, 0, array.ravel()[row]))
+    def spread(vanished: jax.Array) -> jax.Array:
+        """Adds what is left of a thing: edges that few rays meet go with it."""
+        around, inside = _around(change.shape, row)
+        for _ in range(_SPREADS):
+            gone = put(change, jnp.where(vanished, _GONE, counted)).ravel() < _FORGOTTEN
+            remains = jnp.sum(inside & gone[around], axis=1) >= _LEAST_GONE_NEIGHBORS
+            vanished |= remains & ((quarters > 1) | looked_past)
+        return vanished
 
-    passes = window.passes.ravel()[row]
-    return window._replace(
-        hits=clear(window.hits),
-        weight=clear(window.weight),
-        behind=clear(window.behind),
-        passes=put(window.passes, jnp.where(vanished, jnp.maximum(jnp.abs(passes), 1), passes)),
-        change=put(change, jnp.where(vanished, _GONE, counted)),
-    )
+    many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_NEIGHBORS
+    vanished = jax.lax.cond(many, spread, lambda vanished: vanished, vanished)
+    window = window._replace(change=put(change, counted))
+    return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
 
 
-def _gone_neighbors(change: jax.Array, row: jax.Array) -> jax.Array:
-    """Counts the vanished voxels up to two voxels from each row of the raveled window."""
-    steps = np.stack(np.meshgrid(*3 * [[-2, -1, 0, 1, 2]], indexing="ij"), axis=-1).reshape(-1, 3)
-    index = jnp.stack(jnp.unravel_index(row, change.shape), axis=-1)[:, None] + steps
-    inside = jnp.all((index >= 0) & (index < jnp.asarray(change.shape)), axis=-1)
-    around = geometry.flat_index(change.shape, split(jnp.where(inside[..., None], index, 0)))
-    return jnp.sum(inside & (change.ravel()[around] < _FORGOTTEN), axis=1)
+def _around(shape: tuple[int, ...], row: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Finds the 5 x 5 x 5 voxels around each row of a raveled window, and which are inside."""
+    steps = np.stack(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
+    index = jnp.stack(jnp.unravel_index(row, shape), axis=-1)[:, None] + steps
+    inside = jnp.all((index >= 0) & (index < jnp.asarray(shape)), axis=-1)
+    return geometry.flat_index(shape, split(jnp.where(inside[..., None], index, 0))), inside
 
 
 def is_recent(change: jax.Array) -> jax.Array:
@@ -129,7 +133,7 @@ def is_recent(change: jax.Array) -> jax.Array:
 
 
 def _look(
-    config: Config, window: EvidenceWindow, rays: Rays, row: jax.Array
+    config: Config, window: EvidenceWindow, rays: Rays, view: View, row: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Counts the quarters of patches that rays cross, and finds those that all rays see past."""
     size, shape = config.voxel_size, window.hits.shape
@@ -139,8 +143,7 @@ def _look(
     sensor_world = split(rays.sensor_world)
     offset = each(lambda c, m, s: c + m * size - s, center_world, mean, sensor_world)
     distance = length(offset)
-    image = directions.range_image(rays, rays.in_range)
-    filled = directions.fill_gaps(image)
+    image, filled = view
     pixel = directions.pixel_of(offset)
     past = (filled.farthest[pixel] > distance + size) & (
         filled.nearest[pixel] > distance + 0.5 * size
@@ -150,12 +153,12 @@ def _look(
     long, middle, short = (take(axes, row, first) for first in (0, 3, 6))
     # A flat patch is a rectangle. Of others, the rectangle faces the sensor.
     flat = length(short) < 0.5 * length(middle)
-    unit_long = _unit(long)
-    away = _unit(offset)
+    unit_long = unit(long)
+    away = unit(offset)
     along = dot(away, unit_long)
-    facing = _unit(each(lambda a, u: a - along * u, away, unit_long))
-    normal = each(lambda s, f: jnp.where(flat, s, f), _unit(short), facing)
-    across = _cross(normal, unit_long)
+    facing = unit(each(lambda a, u: a - along * u, away, unit_long))
+    normal = each(lambda s, f: jnp.where(flat, s, f), unit(short), facing)
+    across = cross(normal, unit_long)
     least = _LEAST_HALF_VOXELS * size
 
     def half(deviation: jax.Array) -> jax.Array:
@@ -187,16 +190,3 @@ def _look(
             met = crosses & ((u < 0) == left) & ((v < 0) == low)
             quarters += jnp.any(met, axis=-1)
     return quarters, past
-
-
-def _unit(vector: Vector) -> Vector:
-    norm = jnp.maximum(length(vector), 1e-6)
-    return each(lambda v: v / norm, vector)
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )

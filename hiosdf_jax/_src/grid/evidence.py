@@ -121,6 +121,32 @@ def fade_evidence(config: Config, window: EvidenceWindow) -> EvidenceWindow:
     )
 
 
+def clear_patches(window: EvidenceWindow, voxels: jax.Array, change: int) -> EvidenceWindow:
+    """Removes patches; their voxels are free.
+
+    Args:
+        window: The window.
+        voxels: Indices into the raveled window, (K,) int32, each once or more often; those at or
+            above its size are skipped.
+        change: The voxels' `change` afterwards.
+
+    Returns:
+        The window.
+    """
+
+    def put(array: jax.Array, values: float | jax.Array) -> jax.Array:
+        return array.ravel().at[voxels].set(values, mode="drop").reshape(array.shape)
+
+    passes = window.passes.ravel()[jnp.minimum(voxels, window.passes.size - 1)]
+    return window._replace(
+        hits=put(window.hits, 0),
+        weight=put(window.weight, 0),
+        behind=put(window.behind, 0),
+        passes=put(window.passes, jnp.maximum(jnp.abs(passes), 1)),
+        change=put(window.change, change),
+    )
+
+
 def is_observed(passes: jax.Array, hits: jax.Array) -> jax.Array:
     """Returns a mask of the voxels that a ray has reached.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.mapping.pipeline import init
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state import MapState, check_map
 
 _FORMAT = "hiosdf_jax map"
 _VERSION = 3
@@ -62,8 +62,7 @@ def save(path: str | os.PathLike[str], state: MapState) -> None:
     Example:
         >>> hio.save("house.npz", state)
     """
-    if not isinstance(state, MapState):
-        raise ValueError(f"state is {type(state).__name__}, expected a MapState")
+    check_map(state)
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "no such folder", str(path.parent))

@@ -13,7 +13,7 @@ from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.grid.frontier import recompute_frontier
-from hiosdf_jax._src.state import Evidence, Grid, MapState
+from hiosdf_jax._src.state import Evidence, Grid, MapState, check_map
 
 
 def forget(state: MapState, box: Any) -> MapState:
@@ -37,8 +37,7 @@ def forget(state: MapState, box: Any) -> MapState:
     Example:
         >>> state = hio.forget(state, ((1.0, 0.0, 0.0), (2.0, 0.2, 2.1)))
     """
-    if not isinstance(state, MapState):
-        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    check_map(state)
     try:
         corners = np.asarray(box, np.float32)
     except (TypeError, ValueError):

@@ -12,7 +12,7 @@ import numpy as np
 from hiosdf_jax._src.change.novelty import compare_cloud
 from hiosdf_jax._src.grid.rays import place_cloud
 from hiosdf_jax._src.numerics.posed_cloud import check_extras, check_pose, check_shapes
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state import MapState, check_map
 
 
 def moving_rows(
@@ -39,8 +39,7 @@ def moving_rows(
         >>> moving = hio.moving_rows(state, cloud, pose)
         >>> state = hio.update(state, cloud, pose)
     """
-    if not isinstance(state, MapState):
-        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    check_map(state)
     _, sigma = check_extras(None, noise)
     check_shapes(cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((state, cloud, pose))):

@@ -28,7 +28,7 @@ from hiosdf_jax._src.numerics.posed_cloud import (
     prepare,
     warn_out_of_range,
 )
-from hiosdf_jax._src.state import Field, MapState, Report, field_of
+from hiosdf_jax._src.state import Field, MapState, Report, check_map, field_of
 
 
 def init(config: Config, key: jax.Array) -> MapState:
@@ -120,8 +120,7 @@ def update(
         >>> for cloud, pose in stream:
         ...     state = hio.update(state, cloud, pose)
     """
-    if not isinstance(state, MapState):
-        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    check_map(state)
     extras = check_extras(robot, noise)
     leaves = (*jax.tree.leaves((state, extras)), cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.change import hiding, novelty, robot, stray, vanishing
+from hiosdf_jax._src.change import directions, hiding, novelty, robot, stray, vanishing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches, rays, windows
 from hiosdf_jax._src.grid.rays import Rays
@@ -157,8 +157,9 @@ def renew_evidence(step: Step) -> Step:
     """Lets new evidence outweigh old: things that appear, space that they hide, what vanished."""
     config, before, placed = step.config, step.before, step.rays
     window, fresh = hiding.add_new_surfaces(config, before, step.window, placed, step.novelty)
-    window = hiding.hide_behind(config, before, window, placed, fresh)
-    window = vanishing.drop_vanished(config, before, window, placed, step.state.updates)
+    view = directions.view_of(placed)
+    window = hiding.hide_behind(config, before, window, placed, view, fresh)
+    window = vanishing.drop_vanished(config, before, window, placed, view, step.state.updates)
     if step.robot is not None:
         window = robot.clear_robot(config, window, *step.robot)
     return step._replace(window=window)
@@ -271,15 +272,14 @@ def run_stages(step: Step, stages: Sequence[Stage]) -> Step:
 def is_accepted(step: Step) -> jax.Array:
     """Returns whether the checked cloud is to be fused, () bool."""
     refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE
-    inconsistent = (step.flags & Flag.INCONSISTENT_CLOUD) > 0
     patient = step.state.report.refused_in_row < step.config.most_refusals
-    return ((step.flags & refused) == 0) & ~(inconsistent & patient)
+    return ~_has(step, refused) & ~(_has(step, Flag.INCONSISTENT_CLOUD) & patient)
 
 
 def refuse(state: MapState, step: Step) -> MapState:
     """Returns the map as it was, with the flags of a checked cloud that is not fused."""
     report = state.report
-    inconsistent = (step.flags & Flag.INCONSISTENT_CLOUD) > 0
+    inconsistent = _has(step, Flag.INCONSISTENT_CLOUD)
     return state.replace(
         report=report.replace(
             refused_in_row=report.refused_in_row + inconsistent.astype(jnp.int32),
@@ -291,6 +291,11 @@ def refuse(state: MapState, step: Step) -> MapState:
 
 def _flag(step: Step, flag: Flag, raised: jax.Array) -> Step:
     return step._replace(flags=step.flags | jnp.where(raised, flag, 0).astype(jnp.uint32))
+
+
+def _has(step: Step, flags: Flag) -> jax.Array:
+    """Returns whether this update has one of some flags."""
+    return (step.flags & flags) > 0
 
 
 def _with_grid(step: Step, grid: Grid) -> Step:

@@ -56,6 +56,21 @@ def dot(first: Vector, second: Vector) -> jax.Array:
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
+def cross(first: Vector, second: Vector) -> Vector:
+    """Computes vector products."""
+    return (
+        first[1] * second[2] - first[2] * second[1],
+        first[2] * second[0] - first[0] * second[2],
+        first[0] * second[1] - first[1] * second[0],
+    )
+
+
+def unit(vector: Vector) -> Vector:
+    """Scales vectors to length 1; those shorter than 1e-6 keep less."""
+    norm = jnp.maximum(length(vector), 1e-6)
+    return each(lambda v: v / norm, vector)
+
+
 def length(vector: Vector) -> jax.Array:
     """Computes lengths, with gradient 0 instead of NaN at 0."""
     square = dot(vector, vector)

@@ -13,8 +13,8 @@ from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.samples.draw import Samples, draw_from_mask
 from hiosdf_jax._src.state import NO_FEATURE, Grid, surface_of
 
-# Far samples around changes, where the network is wrong by most: so many for each changed voxel, up
-# to a share of all, at this standard deviation from it.
+# Far samples around changes, where the network is most wrong: their number per changed voxel, their
+# largest share of all far samples, and their standard deviation from the voxel.
 _PER_CHANGED_VOXEL = 10
 _MOST_CHANGED_SHARE = 0.25
 _CHANGED_SPREAD_M = 0.35
