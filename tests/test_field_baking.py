@@ -139,3 +139,18 @@ def test_bad_arguments_are_named(field, baked):
         hio.bake(baked)
     with pytest.raises(ValueError, match="expected a MapState, a Field or a Baked"):
         hio.sdf("map", np.zeros(3))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_window_around_no_place_is_refused_or_in_collision(room_map, value):
+    center = np.array([value, 0.0, 0.0], np.float32)
+    with pytest.raises(ValueError, match=r"center is .*, expected finite coordinates"):
+        hio.bake(room_map, 0.2, center=center, size=(1, 1, 1))
+    baked = jax.jit(lambda state, c: hio.bake(state, 0.2, center=c, size=(1, 1, 1)))(
+        room_map, center
+    )
+    points = np.array([[0, 0, 0], [0.3, -0.2, 0.1], [5, 5, 5]], np.float32)
+    for unknown in ("network", "obstacle"):
+        answer = hio.query(baked, points, unknown=unknown)
+        assert (np.asarray(answer.sdf) < -1e3).all() and (np.asarray(answer.lower) < -1e3).all()
+        assert not np.asarray(answer.observed).any()

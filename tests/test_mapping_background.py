@@ -1,7 +1,10 @@
 """Mapping in a thread: the same map, valid fields, and a planner that never waits."""
 
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,3 +82,70 @@ def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch)
         mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
         mapper.close()
+
+
+BAD_CLOUDS = {
+    "huge numbers": [[10**400, 0, 0]],
+    "complex numbers": np.ones((3, 3), complex),
+    "words": [["a", "b", "c"]],
+    "nothing": None,
+    "an object": object(),
+}
+
+
+@pytest.mark.parametrize("cloud", BAD_CLOUDS.values(), ids=BAD_CLOUDS.keys())
+def test_a_frame_of_a_wrong_type_is_counted_and_mapping_continues(empty_map, cloud):
+    with hio.BackgroundMapper(empty_map) as mapper:
+        mapper.put(cloud, np.eye(4))
+        mapper.wait()
+        mapper.put(*stream(1)[0])
+    assert mapper.rejected == 1 and mapper.rejection is not None
+    assert int(mapper.field.updates) == 1
+
+
+@pytest.mark.parametrize("stamp", [None, "soon", np.nan, np.inf, 10**400])
+def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
+    with hio.BackgroundMapper(empty_map) as mapper:
+        with pytest.raises(ValueError, match=r"stamp is .*, expected a finite number of seconds"):
+            mapper.put(*stream(1)[0], stamp)
+        assert mapper.wait() is empty_map
+
+
+def test_a_mapper_takes_maps_only(empty_map):
+    with pytest.raises(ValueError, match="state is Field, expected a MapState"):
+        hio.BackgroundMapper(hio.snapshot(empty_map))
+
+
+ENDINGS = {"end of the script": ("", 0), "exit": ("sys.exit(7)", 7), "exception": ("1 / 0", 1)}
+
+
+@pytest.mark.parametrize("ending, code", ENDINGS.values(), ids=ENDINGS.keys())
+def test_a_mapper_that_is_not_closed_does_not_crash_the_interpreter(ending, code):
+    """It works on a frame while the interpreter ends."""
+    script = f"""
+import sys, time
+import jax, jax.numpy as jnp
+import hiosdf_jax as hio
+from room import CONFIG
+from hiosdf_jax._src.mapping import background
+
+@jax.jit
+def work(x):
+    return jax.lax.fori_loop(0, 300, lambda _, x: jnp.tanh(x @ x), x)
+
+def update(state, cloud, pose):
+    for _ in range(10):
+        jax.block_until_ready(work(jnp.ones((200, 200))))
+    return state
+
+background.update = update
+mapper = hio.BackgroundMapper(hio.init(CONFIG, jax.random.key(0)))
+for _ in range(3):
+    mapper.put(None, None)
+    time.sleep(0.2)
+{ending}
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, timeout=60
+    )
+    assert done.returncode == code, done.stderr.decode()[-2000:]

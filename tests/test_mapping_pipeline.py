@@ -113,6 +113,11 @@ BAD = {
     "bad last row": (np.ones((2, 3)), np.diag([1.0, 1, 1, 2]), "pose is not rigid"),
     "flat cloud": (np.ones(6), np.eye(4), r"cloud has shape \(6,\), expected \(N, 3\)"),
     "wide cloud": (np.ones((2, 4)), np.eye(4), r"cloud has shape \(2, 4\), expected \(N, 3\)"),
+    "complex cloud": (np.ones((2, 3), complex), np.eye(4), "cloud has dtype complex128, expected"),
+    "words": ([["a", "b", "c"]], np.eye(4), "cloud has dtype <U1, expected real numbers"),
+    "huge numbers": ([[10**400, 0, 0]], np.eye(4), "cloud has dtype object, expected real"),
+    "ragged cloud": ([[1, 2, 3], [4, 5]], np.eye(4), "cloud is no array"),
+    "no pose": (np.ones((2, 3)), None, "pose has dtype object, expected real numbers"),
     "small pose": (np.ones((2, 3)), np.eye(3), r"pose has shape \(3, 3\), expected \(4, 4\)"),
 }
 
@@ -123,6 +128,22 @@ def test_bad_input_raises_and_names_the_argument(room_map, cloud, pose, message)
     with pytest.raises(ValueError, match=message):
         hio.update(room_map, cloud, pose)
     assert arrays_equal(before, room_map)
+
+
+@pytest.mark.parametrize("dtype", [">f4", "f2", "f8", np.longdouble])
+def test_numbers_of_every_type_are_taken(empty_map, dtype):
+    cloud, pose = stream(1)[0]
+    cloud, pose = cloud.astype(np.float16), np.asarray(pose, np.float16)
+    plain = hio.update(empty_map, cloud.astype(np.float32), pose.astype(np.float32))
+    assert arrays_equal(hio.update(empty_map, cloud.astype(dtype), pose.astype(dtype)), plain)
+
+
+def test_masked_rows_are_no_returns(empty_map):
+    cloud, pose = stream(1)[0]
+    masked = np.ma.masked_array(cloud, np.arange(len(cloud))[:, None].repeat(3, 1) >= 100)
+    assert arrays_equal(
+        hio.update(empty_map, masked, pose).grid, hio.update(empty_map, cloud[:100], pose).grid
+    )
 
 
 def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty_map):
@@ -149,20 +170,35 @@ def test_range_limits_are_counted(empty_map):
     assert float(jnp.sum(state.grid.evidence.hits)) == 1
 
 
-def test_equivariance_to_moves_by_whole_voxels(room_map):
-    """The same stream in a box moved by whole voxels gives the same map, moved."""
-    move = np.array([3.0, -2.0, 1.0], np.float32)  # multiples of 0.1 m; exact in binary
-    moved = dataclasses.replace(
-        CONFIG, bounds=tuple(tuple(np.add(corner, move)) for corner in BOUNDS)
-    )
-    state = hio.init(moved, jax.random.key(0))
+MOVE = np.array([3.0, -2.0, 1.0], np.float32)  # multiples of 0.1 m; exact in binary
+
+
+def moved(pose):
+    pose = np.array(pose)
+    pose[:3, 3] += MOVE
+    return pose
+
+
+@pytest.fixture(scope="module")
+def moved_map():
+    """The map of the same stream in a box moved by whole voxels, which takes all clouds.
+
+    Two tests share it: a configuration of its own compiles `update` anew.
+    """
+    bounds = tuple(tuple(np.add(corner, MOVE)) for corner in BOUNDS)
+    config = dataclasses.replace(CONFIG, bounds=bounds, min_in_range=0.0)
+    state = hio.init(config, jax.random.key(0))
     for cloud, pose in stream():
-        pose = pose.copy()
-        pose[:3, 3] += move
-        state = hio.update(state, cloud, pose)
-    assert np.mean(np.asarray(state.grid.evidence.hits != room_map.grid.evidence.hits)) < 0.01
+        state = hio.update(state, cloud, moved(pose))
+    return state
+
+
+def test_equivariance_to_moves_by_whole_voxels(room_map, moved_map):
+    """The same stream in a box moved by whole voxels gives the same map, moved."""
+    hits = moved_map.grid.evidence.hits
+    assert np.mean(np.asarray(hits != room_map.grid.evidence.hits)) < 0.01
     points = np.random.default_rng(2).uniform(-0.5, 0.5, (2000, 3)).astype(np.float32)
-    difference = hio.sdf(state, points + move) - hio.sdf(room_map, points)
+    difference = hio.sdf(moved_map, points + MOVE) - hio.sdf(room_map, points)
     assert float(jnp.mean(jnp.abs(difference))) < 0.02
 
 
@@ -233,15 +269,15 @@ def test_a_cloud_out_of_range_changes_nothing_but_the_flags(room_map, cloud):
     assert arrays_equal(after, room_map.replace(report=report))
 
 
-def test_a_cloud_out_of_range_clears_space_and_trains_if_none_need_be_in_range(room_map):
+def test_a_cloud_out_of_range_clears_space_and_trains_if_none_need_be_in_range(moved_map):
     """Its rays clear space, and no flag is raised."""
-    state = room_map.replace(config=dataclasses.replace(CONFIG, min_in_range=0.0))
-    index, _, _ = geometry.voxel_of(CONFIG, jnp.asarray([[0.3, 0.3, 0.3]]))
+    state = moved_map
+    index, _, _ = geometry.voxel_of(state.config, jnp.asarray([MOVE + 0.3]))
     at = tuple(np.asarray(index)[0])
     for name, cloud in OUT_OF_RANGE.items():
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            after = hio.update(state, cloud, np.eye(4))
+            after = hio.update(state, cloud, moved(np.eye(4)))
         assert int(after.report.flags) == int(after.report.update_flags) == 0
         assert np.isfinite(float(after.report.sdf_loss))
         assert int(after.updates) == int(state.updates) + 1

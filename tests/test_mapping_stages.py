@@ -12,13 +12,18 @@ from hiosdf_jax._src.mapping.stages import CHECKS, FUSION, STAGES, begin, is_acc
 
 @pytest.fixture(scope="module")
 def frame():
-    return tuple(jnp.asarray(array) for array in stream(1)[0])
+    noise = (jnp.float32(0.01), jnp.float32(0.002))  # without it, a stage has nothing to do
+    return (*(jnp.asarray(array) for array in stream(1)[0]), *noise)
 
 
 @pytest.fixture(scope="module")
 def program(empty_map, frame):
     """What `update` computes, as a jaxpr."""
-    return jax.make_jaxpr(hio.update)(empty_map, *frame)
+
+    def update(state, cloud, pose, *noise):
+        return hio.update(state, cloud, pose, noise=noise)
+
+    return jax.make_jaxpr(update)(empty_map, *frame)
 
 
 def scopes(equations):
@@ -59,8 +64,10 @@ def test_update_is_the_stages_one_by_one(program, empty_map, frame):
             step = stage(step)
         return step.state
 
-    def by_hand(state, cloud, pose):
-        step = begin(state, cloud, jnp.all(jnp.isfinite(cloud), axis=-1), pose)
+    def by_hand(state, cloud, pose, *noise):
+        noise = jnp.stack(noise)
+        finite = jnp.all(jnp.isfinite(cloud), axis=-1)
+        step = begin(state, cloud, finite, pose, noise=noise)
         for stage in CHECKS:
             step = stage(step)
         return jax.lax.cond(is_accepted(step), fused, refuse, state, step)

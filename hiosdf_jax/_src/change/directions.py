@@ -121,14 +121,12 @@ def view_of(rays: Rays) -> View:
 
 def fill_gaps(image: RangeImage) -> RangeImage:
     """Fills pixels between rays with the nearest and the farthest range around them."""
-    nearest, farthest = (array.reshape(EDGE, EDGE) for array in (image.nearest, image.farthest))
+    # The largest is the least with its sign reversed. Pixels without rays: inf, and 1 = -(-1).
+    both = jnp.stack([image.nearest, -image.farthest]).reshape(2, EDGE, EDGE)
     for reach in _GAP_PIXELS:
-        around_nearest = _pool(nearest, jnp.inf, jax.lax.min, reach)
-        around_farthest = _pool(farthest, -1.0, jax.lax.max, reach)
-        empty = farthest < 0
-        nearest = jnp.where(empty, around_nearest, nearest)
-        farthest = jnp.where(empty, around_farthest, farthest)
-    return RangeImage(nearest.ravel(), farthest.ravel(), image.row)
+        both = jnp.where(both[1] > 0, _pool(both, jnp.inf, jax.lax.min, reach), both)
+    nearest, farthest = both.reshape(2, EDGE**2)
+    return RangeImage(nearest, -farthest, image.row)
 
 
 def spread_nearest(image: RangeImage, measured: RangeImage) -> jax.Array:
@@ -162,20 +160,20 @@ def dense_parts(rays: Rays, chosen: jax.Array) -> jax.Array:
     """
     pixel = jnp.where(rays.in_range, pixel_of(split(rays.directions_world)), EDGE**2)
 
-    def count(rows: jax.Array) -> jax.Array:
-        image = jnp.zeros(EDGE**2, jnp.float32).at[pixel].add(rows.astype(jnp.float32), mode="drop")
-        return _pool(image.reshape(EDGE, EDGE), 0.0, jax.lax.add, _DENSE_PIXELS)
-
-    dense = count(chosen) > _DENSE_SHARE * count(jnp.ones_like(chosen))
-    return _pool(dense.astype(jnp.float32), 0.0, jax.lax.max, _DENSE_PIXELS).ravel() > 0
+    kinds = jnp.stack([chosen, jnp.ones_like(chosen)]).astype(jnp.float32)
+    counts = jnp.zeros((2, EDGE**2), jnp.float32).at[:, pixel].add(kinds, mode="drop")
+    ours, all_rays = _pool(counts.reshape(2, EDGE, EDGE), 0.0, jax.lax.add, _DENSE_PIXELS)
+    dense = (ours > _DENSE_SHARE * all_rays).astype(jnp.float32)
+    return _pool(dense, 0.0, jax.lax.max, _DENSE_PIXELS).ravel() > 0
 
 
 def _pool(
     values: jax.Array, start: float, function: Callable[..., jax.Array], reach: int
 ) -> jax.Array:
-    """Reduces the square around each pixel, first along columns and then along lines."""
+    """Reduces the square around each pixel of (..., EDGE, EDGE) images, one axis at a time."""
     first = np.asarray(start, values.dtype)  # a float64 under jax_enable_x64 otherwise
     edge = 2 * reach + 1
-    for shape in ((edge, 1), (1, edge)):
-        values = jax.lax.reduce_window(values, first, function, shape, (1, 1), "SAME")
+    others = (1,) * (values.ndim - 2)
+    for shape in ((*others, edge, 1), (*others, 1, edge)):
+        values = jax.lax.reduce_window(values, first, function, shape, (1,) * values.ndim, "SAME")
     return values

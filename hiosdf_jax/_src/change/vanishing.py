@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +16,10 @@ from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
 
-# Patches that one scan can judge; the others are left to later scans.
+# Patches that one scan can judge, and the same as a share of the window's voxels; the others are
+# left to later scans.
 _MOST_SUSPECTS = 8192
+_SUSPECT_SHARE = 1 / 16
 
 # Rays count as through a patch within this share of its half extents, and this many voxels at
 # least: its edges are uncertain.
@@ -77,10 +81,11 @@ def drop_vanished(
     suspects = (window.hits > 0) & ~hit & (passed | (change > 0))
     voxels = suspects.size
     # Where there are too many, each scan judges other slices of the window: none waits forever.
-    slices = 1 + jnp.sum(suspects) // _MOST_SUSPECTS
+    most = min(_MOST_SUSPECTS, math.ceil(_SUSPECT_SHARE * voxels))
+    slices = 1 + jnp.sum(suspects) // most
     slice_of = jnp.arange(suspects.shape[0], dtype=jnp.int32)[:, None, None]
     suspects &= (slice_of + turn) % slices == 0
-    (voxel,) = jnp.nonzero(suspects.ravel(), size=_MOST_SUSPECTS, fill_value=voxels)
+    (voxel,) = jnp.nonzero(suspects.ravel(), size=most, fill_value=voxels)
     row = jnp.minimum(voxel, voxels - 1)
 
     quarters, looked_past = _look(config, window, rays, view, row)
@@ -100,11 +105,13 @@ def drop_vanished(
     def spread(vanished: jax.Array) -> jax.Array:
         """Adds what is left of a thing: edges that few rays meet go with it."""
         around, inside = _around(change.shape, row)
-        for _ in range(_SPREADS):
+
+        def once(_: jax.Array, vanished: jax.Array) -> jax.Array:
             gone = put(change, jnp.where(vanished, _GONE, counted)).ravel() < _FORGOTTEN
             remains = jnp.sum(inside & gone[around], axis=1) >= _LEAST_GONE_NEIGHBORS
-            vanished |= remains & ((quarters > 1) | looked_past)
-        return vanished
+            return vanished | (remains & ((quarters > 1) | looked_past))
+
+        return jax.lax.fori_loop(0, _SPREADS, once, vanished)
 
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_NEIGHBORS
     vanished = jax.lax.cond(many, spread, lambda vanished: vanished, vanished)

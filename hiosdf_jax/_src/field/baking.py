@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -29,7 +30,8 @@ def bake(
         field: A map or a snapshot of one.
         resolution: Spacing of the samples, m; static inside jit.
         center: Center of a window, for instance the robot, (3,) m, world frame; may be traced. By
-            default the whole of the field's bounds is sampled.
+            default the whole of the field's bounds is sampled. Where a traced center is not finite,
+            every place is in collision.
         size: Edges of the window, (3,) m; required with `center`, static inside jit.
 
     Returns:
@@ -58,6 +60,8 @@ def bake(
         center = jnp.asarray(center, jnp.float32)
         if center.shape != (3,):
             raise ValueError(f"center has shape {center.shape}, expected (3,)")
+        if not isinstance(center, jax.core.Tracer) and not np.isfinite(center).all():
+            raise ValueError(f"center is {center}, expected finite coordinates, m")
         corner_world = center - jnp.asarray(size / 2, jnp.float32)
     return _bake(field, corner_world, jnp.float32(resolution), sample_counts(size, resolution))
 
@@ -66,6 +70,10 @@ def bake(
 def _bake(
     field: Field, corner_world: jax.Array, resolution: jax.Array, shape: tuple[int, int, int]
 ) -> Baked:
+    # A NaN point is in collision, and so are all samples where the corner is not finite.
+    known = jnp.all(jnp.isfinite(corner_world))
+    corner_world = jnp.where(known, corner_world, jnp.nan)
+
     def sample(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         place = jnp.stack(jnp.unravel_index(index, shape)).astype(jnp.float32)
         answer = query(field, corner_world + place * resolution)
@@ -79,7 +87,8 @@ def _bake(
     # half a cell's diagonal.
     margin = math.sqrt(3) / 2 * resolution
     return Baked(
-        corner_world=corner_world,
+        # Interpolation at a corner of NaN would give NaN, which compares as free.
+        corner_world=jnp.where(known, corner_world, 0),
         resolution=resolution,
         sdf=sdf.reshape(shape),
         frontier=(frontier - margin).reshape(shape),

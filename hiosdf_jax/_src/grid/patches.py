@@ -211,7 +211,9 @@ def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     a = {(i, j): spread[..., i, j] for i in range(3) for j in range(i, 3)}
     one, zero = jnp.ones_like(spread[..., 0, 0]), jnp.zeros_like(spread[..., 0, 0])
     v = [[one if i == j else zero for j in range(3)] for i in range(3)]  # v[k]: k-th eigenvector
-    for _ in range(_JACOBI_SWEEPS):
+
+    def sweep(_: jax.Array, carry: tuple[dict, list]) -> tuple[dict, list]:
+        a, v = dict(carry[0]), [list(row) for row in carry[1]]
         for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
             off = a[p, q]
             gap = a[q, q] - a[p, p]
@@ -228,6 +230,9 @@ def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
             a[p, q] = zero
             for k in range(3):
                 v[p][k], v[q][k] = c * v[p][k] - s * v[q][k], s * v[p][k] + c * v[q][k]
+        return a, v
+
+    a, v = jax.lax.fori_loop(0, _JACOBI_SWEEPS, sweep, (a, v))
     value = jnp.stack([a[0, 0], a[1, 1], a[2, 2]], axis=-1)
     vector = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
     order = jnp.argsort(-value, axis=-1)

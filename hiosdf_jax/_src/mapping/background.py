@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import atexit
+import math
 import threading
 from typing import Any
 
 import jax
 
 from hiosdf_jax._src.mapping.pipeline import update
-from hiosdf_jax._src.state import Field, MapState, field_of
+from hiosdf_jax._src.state import Field, MapState, check_map, field_of
+
+# What `update` raises for a bad frame: the others are faults of the machine or of this library.
+_BAD_FRAME = (ValueError, TypeError, OverflowError)
 
 
 class BackgroundMapper:
     """Updates a map in a background thread; `field` is always the newest finished map.
 
     One frame waits while another is fused. A newer frame replaces the waiting one, so that a slow
-    machine maps fewer frames and not older ones. Use it in a `with` block, or call `close`.
+    machine maps fewer frames and not older ones. Use it in a `with` block, or call `close`. When
+    the interpreter exits, a mapper that is still open finishes the frame that it is fusing.
 
     Attributes:
         field: The newest snapshot, with the stamp of its frame. Reading it never waits.
         dropped: Number of frames that newer ones replaced.
         rejected: Number of frames that `update` refused.
-        rejection: The last ValueError of `update`, or None.
+        rejection: The exception of the last of them, or None.
 
     Example:
         >>> with hio.BackgroundMapper(state) as mapper:
@@ -34,11 +40,15 @@ class BackgroundMapper:
 
         Args:
             state: The map so far, from `init`, `load` or another mapper. Do not donate it later.
+
+        Raises:
+            ValueError: `state` is not a map.
         """
+        check_map(state)
         self.field: Field = field_of(state)
         self.dropped = 0
         self.rejected = 0
-        self.rejection: ValueError | None = None
+        self.rejection: Exception | None = None
         self._state = state
         self._waiting: tuple[Any, Any, float] | None = None
         self._busy = False
@@ -47,6 +57,8 @@ class BackgroundMapper:
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._work, name="hiosdf_jax", daemon=True)
         self._thread.start()
+        # A thread that runs compiled code while the interpreter ends would crash it.
+        atexit.register(self._abandon)
 
     def put(self, cloud: Any, pose: Any, stamp: float = 0.0) -> None:
         """Hands a frame over and returns at once.
@@ -57,14 +69,21 @@ class BackgroundMapper:
             stamp: Time of the frame, s on the caller's clock, counted from the start of the run.
 
         Raises:
+            ValueError: `stamp` is not a finite number.
             RuntimeError: The mapper is closed, or its thread has failed.
         """
+        try:
+            seconds = float(stamp)
+        except _BAD_FRAME:
+            seconds = math.nan
+        if not math.isfinite(seconds):
+            raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
         with self._changed:
             self._check()
             if self._closed:
                 raise RuntimeError("the BackgroundMapper is closed")
             self.dropped += self._waiting is not None
-            self._waiting = (cloud, pose, stamp)
+            self._waiting = (cloud, pose, seconds)
             self._changed.notify_all()
 
     def wait(self) -> MapState:
@@ -96,8 +115,17 @@ class BackgroundMapper:
             self._closed = True
             self._changed.notify_all()
         self._thread.join()
+        atexit.unregister(self._abandon)
         self._check()
         return self._state
+
+    def _abandon(self) -> None:
+        """Ends the thread without fusing the waiting frame."""
+        with self._changed:
+            self._waiting = None
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
 
     def __enter__(self) -> BackgroundMapper:
         """Returns the mapper itself."""
@@ -130,7 +158,7 @@ class BackgroundMapper:
             # Finished before it is published, so that no reader waits for the device. The old state
             # is not donated, so that the old field stays valid without a copy.
             state = jax.block_until_ready(update(self._state, cloud, pose))
-        except ValueError as reason:
+        except _BAD_FRAME as reason:
             self.rejected += 1
             self.rejection = reason
             return

@@ -106,7 +106,8 @@ def update(
             instance from `planning.place_spheres`. Returns within 3 cm of them leave no surface and
             clear no space.
         noise: (a, b) of the standard deviation a + b r^2 of this cloud's returns at range r, m and
-            1/m, for sensors of different quality. By default it is `config.range_noise`.
+            1/m, for sensors of different quality. By default it is `config.range_noise`. Where it
+            is given and exceeds a fifth of a voxel, ranges are averaged over neighboring rays.
 
     Returns:
         The new map.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.change import directions, hiding, novelty, robot, stray, vanishing
+from hiosdf_jax._src.change import directions, hiding, novelty, robot, smoothing, stray, vanishing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches, rays, windows
 from hiosdf_jax._src.grid.rays import Rays
@@ -122,6 +122,13 @@ def drop_stray(step: Step) -> Step:
     kept = ~stray.find_stray(step.rays)
     placed = step.rays._replace(ends=step.rays.ends & kept, in_range=step.rays.in_range & kept)
     return step._replace(rays=placed)
+
+
+def smooth_ranges(step: Step) -> Step:
+    """Averages the ranges of a cloud whose noise is given and large."""
+    if step.noise is None:
+        return step
+    return step._replace(rays=smoothing.smooth_ranges(step.config, step.rays))
 
 
 def compare_cloud(step: Step) -> Step:
@@ -238,7 +245,7 @@ def summarize(step: Step) -> Step:
     return step._replace(state=state.replace(updates=state.updates + 1, report=report))
 
 
-CHECKS: tuple[Stage, ...] = (place_cloud, drop_stray, compare_cloud)
+CHECKS: tuple[Stage, ...] = (place_cloud, drop_stray, smooth_ranges, compare_cloud)
 """Stages that decide whether the cloud is fused."""
 
 FUSION: tuple[Stage, ...] = (

@@ -180,7 +180,7 @@ def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:
 def _order(config: Config, count: int, key: jax.Array) -> jax.Array:
     """Shuffles samples for several batches or groups."""
     if config.batches > 1:
-        return jax.random.permutation(key, count)
+        return jnp.argsort(jax.random.bits(key, (count,), jnp.uint32))
     if config.eikonal_every > 1:
         # The samples are drawn anew at every update, so one order suffices. Their own order would
         # not do: there each n-th sample of a ray is at the same depth.

@@ -44,8 +44,7 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
         ValueError: The pose is misshapen, not finite or not rigid.
     """
     prefix = f"{source}: " if source else ""
-    with np.errstate(over="ignore"):  # too large for float32 becomes inf, which is refused below
-        matrix = np.array(pose, np.float32)
+    matrix = np.array(as_floats(f"{prefix}pose", pose))  # too large for float32: inf, refused below
     _check_pose_shape(matrix, prefix)
     if not np.isfinite(matrix).all():
         raise ValueError(
@@ -58,6 +57,30 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
             f"{_printed(matrix)}"
         )
     return matrix
+
+
+def as_floats(name: str, values: Any) -> np.ndarray:
+    """Converts an argument to float32. Masked elements become NaN.
+
+    Args:
+        name: What messages call the argument.
+        values: Real numbers in an array, or what numpy makes one of.
+
+    Returns:
+        The array; not a copy if it is float32 already.
+
+    Raises:
+        ValueError: The values are no real numbers.
+    """
+    try:
+        array = np.ma.asanyarray(values) if np.ma.isMaskedArray(values) else np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} is no array: {error}") from None
+    if not (jnp.issubdtype(array.dtype, np.floating) or jnp.issubdtype(array.dtype, np.integer)):
+        raise ValueError(f"{name} has dtype {array.dtype}, expected real numbers")
+    with np.errstate(over="ignore"):
+        floats = array.astype(np.float32, copy=False)
+    return np.ma.filled(floats, np.nan) if np.ma.isMaskedArray(floats) else floats
 
 
 def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
@@ -88,7 +111,9 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
         _check_values("robot radii", radii, 0)
         robot = (jnp.asarray(centers, jnp.float32), jnp.asarray(radii, jnp.float32))
     if noise is not None:
-        if np.shape(noise) != (2,) and not (isinstance(noise, tuple) and len(noise) == 2):
+        # Tracers in a tuple have no shape of their own.
+        shape = (len(noise),) if isinstance(noise, tuple | list) else np.shape(noise)
+        if shape != (2,):
             raise ValueError(f"noise is {noise!r}, expected two numbers (a, b)")
         floor, growth = noise
         _check_values("noise a", floor, float(np.finfo(np.float32).tiny))
@@ -146,7 +171,7 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         ValueError: A shape is wrong, the pose is not finite or not rigid, or the cloud has no
             finite row.
     """
-    cloud, pose = np.asarray(cloud, np.float32), check_pose(pose)
+    cloud, pose = as_floats("cloud", cloud), check_pose(pose)
     finite = finite_rows(cloud)
     padded = np.empty((capacity, 3), np.float32)
     count = len(cloud)
