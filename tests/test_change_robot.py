@@ -58,6 +58,14 @@ def test_patches_in_spheres_are_removed_and_others_are_kept(window, seed):
     )
 
 
+def test_a_sphere_of_many_voxels_keeps_no_patch(window):
+    centers, radii = np.array([[0.3, 0.4, 0.5]], np.float32), np.array([0.75], np.float32)
+    ghosts = inside_of(window, centers.astype(float), radii.astype(float))
+    cleared = clear(CONFIG, window, jnp.asarray(centers), jnp.asarray(radii))
+    assert ghosts.sum() > 200
+    np.testing.assert_array_equal(np.asarray(cleared.hits)[ghosts], 0)
+
+
 def test_spheres_without_a_patch_change_nothing(window):
     apart = np.array([[9.0, 0, 0], [0.3, 0.5, 0.6], [0.3, 0.5, 0.6]], np.float32)
     none = jnp.asarray([3.0, 0.0, 0.0], jnp.float32)

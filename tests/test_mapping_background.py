@@ -35,27 +35,28 @@ def test_the_newest_frame_replaces_the_waiting_one(empty_map, monkeypatch):
     fused = []
 
     def slow(state, cloud, pose):
-        fused.append(cloud)
+        fused.append(float(cloud[0, 0]))
         begun.set()
         assert go.wait(10)
         return state
 
     monkeypatch.setattr(background, "update", slow)
     mapper = hio.BackgroundMapper(empty_map)
-    mapper.put("first", None)
+    pose = np.eye(4)
+    mapper.put(np.zeros((1, 3)), pose)
     assert begun.wait(10)
     before = mapper.field
     start = time.perf_counter()
     for k in range(5):
-        mapper.put(k, None)
+        mapper.put(np.full((1, 3), k + 1), pose)
     assert mapper.field is before  # readable while an update runs
     assert time.perf_counter() - start < 1.0
     assert mapper.dropped == 4
     go.set()
     mapper.close()
-    assert fused == ["first", 4]
+    assert fused == [0, 5]
     with pytest.raises(RuntimeError, match="is closed"):
-        mapper.put(5, None)
+        mapper.put(np.zeros((1, 3)), pose)
 
 
 def test_a_bad_frame_is_counted_and_mapping_continues(empty_map):
@@ -84,7 +85,13 @@ def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch)
         mapper.close()
 
 
+class Unreadable:
+    def __array__(self, *_, **__):
+        raise RuntimeError("on another device")
+
+
 BAD_CLOUDS = {
+    "unreadable": Unreadable(),
     "huge numbers": [[10**400, 0, 0]],
     "complex numbers": np.ones((3, 3), complex),
     "words": [["a", "b", "c"]],
@@ -103,7 +110,7 @@ def test_a_frame_of_a_wrong_type_is_counted_and_mapping_continues(empty_map, clo
     assert int(mapper.field.updates) == 1
 
 
-@pytest.mark.parametrize("stamp", [None, "soon", np.nan, np.inf, 10**400])
+@pytest.mark.parametrize("stamp", [None, "soon", np.nan, np.inf, 10**400, 1e39])
 def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
     with hio.BackgroundMapper(empty_map) as mapper:
         with pytest.raises(ValueError, match=r"stamp is .*, expected a finite number of seconds"):
@@ -141,7 +148,7 @@ def update(state, cloud, pose):
 background.update = update
 mapper = hio.BackgroundMapper(hio.init(CONFIG, jax.random.key(0)))
 for _ in range(3):
-    mapper.put(None, None)
+    mapper.put(jnp.ones((5, 3)), jnp.eye(4))
     time.sleep(0.2)
 {ending}
 """

@@ -129,6 +129,9 @@ def test_the_configurations_noise_is_the_default(empty_map):
         ({"robot": (CENTERS, -RADII)}, "robot radii has values"),
         ({"noise": 0.01}, "noise is 0.01, expected two numbers"),
         ({"noise": (0.0, 0.1)}, "noise a has values"),
+        ({"noise": (1e-22, 0.0)}, "noise a has values"),
+        ({"noise": (10**400, 0.0)}, "noise a has dtype object"),
+        ({"robot": ([["a", "b", "c"]], [1.0])}, "robot centers has dtype"),
         ({"noise": (0.01, -0.1)}, "noise b has values"),
     ],
 )
@@ -149,3 +152,26 @@ def test_a_pose_too_far_away_is_refused(empty_map):
     flag = jnp.uint32(hio.Flag.BAD_POSE)
     flagged = empty_map.report.replace(flags=flag, update_flags=flag)
     assert arrays_equal(inside, empty_map.replace(report=flagged))
+
+
+BAD_INSIDE_JIT = {
+    "NaN center": {"robot": (CENTERS * np.nan, RADII)},
+    "negative radius": {"robot": (CENTERS, -RADII)},
+    "infinite radius": {"robot": (CENTERS, RADII * np.inf)},
+    "no noise": {"noise": np.zeros(2, np.float32)},
+    "NaN noise": {"noise": np.full(2, np.nan, np.float32)},
+    "tiny noise": {"noise": np.array([1e-22, 0], np.float32)},
+}
+
+
+@pytest.mark.parametrize("extras", BAD_INSIDE_JIT.values(), ids=BAD_INSIDE_JIT.keys())
+def test_bad_extras_inside_jit_change_nothing_and_raise_a_flag(empty_map, extras):
+    cloud, pose = room_cloud(0)
+    padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
+    padded[: len(cloud)] = cloud
+    # What `update` compiles, so that it is compiled once for all.
+    robot, noise = extras.get("robot", (CENTERS, RADII)), extras.get("noise", CONFIG.range_noise)
+    after = pipeline._update_jit(empty_map, padded, pose, robot, jnp.asarray(noise, jnp.float32))
+    flag = jnp.uint32(hio.Flag.BAD_ARGUMENT)
+    flagged = empty_map.report.replace(flags=flag, update_flags=flag)
+    assert arrays_equal(after, empty_map.replace(report=flagged))

@@ -40,6 +40,9 @@ class Flag(enum.IntFlag):
     INCONSISTENT_CLOUD = 32
     """A cloud contradicted the map as a whole. It was not fused, unless `Config.most_refusals`
     clouds in a row had been refused before it: check the pose and the sensor."""
+    BAD_ARGUMENT = 64
+    """Inside jit, `robot` or `noise` was not finite or out of range. That update changed nothing
+    else."""
 
 
 class Report(flax.struct.PyTreeNode):

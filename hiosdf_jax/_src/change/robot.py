@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
-from hiosdf_jax._src.numerics.vectors import each, length, split, take
+from hiosdf_jax._src.numerics.vectors import each, length, split
 
-# Samples across a sphere; they meet every voxel of spheres up to five voxels in radius.
-_ACROSS = 11
+# Patches in the box around the robot that one update can judge; the others are left to the next.
+_MOST_PATCHES = 32_768
 
 
 def clear_robot(
@@ -29,22 +28,25 @@ def clear_robot(
     Returns:
         The window; cleared voxels are free.
     """
-    lattice = np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, _ACROSS)], indexing="ij"), axis=-1)
-    samples = lattice.reshape(1, -1, 3).astype(np.float32) * radii[:, None, None]
-    samples_world = centers_world[:, None] + samples
-    shape, size = window.hits.shape, config.voxel_size
-    index, _, inside = geometry.voxel_of_window(config, window.start, shape, samples_world)
-    voxel = jnp.where(inside, geometry.flat_index(shape, split(index)), 0)
-    voxel_world = geometry.voxel_center(config, window.start + index)
-    mean = take(window.mean.reshape(-1, 3), voxel)
-    offset = each(
-        lambda v, m, c: v + m * size - c[:, None],
+    voxels = jnp.meshgrid(*map(jnp.arange, window.hits.shape), indexing="ij")
+    voxel_world = geometry.voxel_center(config, window.start + jnp.stack(voxels, axis=-1))
+    center = each(
+        lambda v, m: (v + m.astype(jnp.float32) * config.voxel_size).ravel(),
         split(voxel_world),
-        mean,
-        split(centers_world),
+        split(window.mean),
     )
-    mapped = inside & (window.hits.ravel()[voxel] > 0)
-    ghost = mapped & (length(offset) < radii[:, None])
-    target = jnp.where(ghost, voxel, window.hits.size).ravel()
 
-    return clear_patches(window, target, 0)
+    # Only patches near the robot are compared with each sphere.
+    def near(c: jax.Array, k: int) -> jax.Array:
+        low, high = centers_world[:, k] - radii, centers_world[:, k] + radii
+        return (c >= jnp.min(low)) & (c <= jnp.max(high))
+
+    mapped = window.hits.ravel() > 0
+    for k in range(3):
+        mapped &= near(center[k], k)
+    count = window.hits.size
+    (row,) = jnp.nonzero(mapped, size=min(count, _MOST_PATCHES), fill_value=count)
+    patch = each(lambda c: c[jnp.minimum(row, count - 1), None], center)
+    apart = length(each(jnp.subtract, patch, split(centers_world)))
+    ghost = jnp.any(apart < radii, axis=1)
+    return clear_patches(window, jnp.where(ghost, row, count), 0)

@@ -8,12 +8,15 @@ import threading
 from typing import Any
 
 import jax
+import numpy as np
 
 from hiosdf_jax._src.mapping.pipeline import update
+from hiosdf_jax._src.numerics.posed_cloud import as_floats
 from hiosdf_jax._src.state import Field, MapState, check_map, field_of
 
 # What `update` raises for a bad frame: the others are faults of the machine or of this library.
-_BAD_FRAME = (ValueError, TypeError, OverflowError)
+# Warnings are raised where the user has made them errors.
+_BAD_FRAME = (ValueError, TypeError, OverflowError, Warning)
 
 
 class BackgroundMapper:
@@ -73,8 +76,9 @@ class BackgroundMapper:
             RuntimeError: The mapper is closed, or its thread has failed.
         """
         try:
-            seconds = float(stamp)
-        except _BAD_FRAME:
+            with np.errstate(over="ignore"):  # becomes inf, which is refused
+                seconds = float(np.float32(stamp))
+        except (*_BAD_FRAME, FloatingPointError):
             seconds = math.nan
         if not math.isfinite(seconds):
             raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
@@ -154,6 +158,12 @@ class BackgroundMapper:
             return frame
 
     def _fuse(self, cloud: Any, pose: Any, stamp: float) -> None:
+        try:
+            cloud, pose = as_floats("cloud", cloud), as_floats("pose", pose)
+        except Exception as reason:  # whatever an object of the user's raises
+            self.rejected += 1
+            self.rejection = reason
+            return
         try:
             # Finished before it is published, so that no reader waits for the device. The old state
             # is not donated, so that the old field stays valid without a copy.

@@ -11,7 +11,7 @@ import numpy as np
 
 from hiosdf_jax._src.change.novelty import compare_cloud
 from hiosdf_jax._src.grid.rays import place_cloud
-from hiosdf_jax._src.numerics.posed_cloud import check_extras, check_pose, check_shapes
+from hiosdf_jax._src.numerics.posed_cloud import as_floats, check_extras, check_pose, check_shapes
 from hiosdf_jax._src.state import MapState, check_map
 
 
@@ -44,10 +44,11 @@ def moving_rows(
     check_shapes(cloud, pose)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((state, cloud, pose))):
         return _moving_rows(state, jnp.asarray(cloud), jnp.asarray(pose), sigma)
+    floats = as_floats("cloud", cloud)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
     rows, step = np.shape(cloud)[0], state.config.max_points
     padded = np.full((-(-max(rows, 1) // step) * step, 3), np.nan, np.float32)
-    padded[:rows] = np.asarray(cloud, np.float32)
+    padded[:rows] = floats
     return _moving_rows_jit(state, padded, check_pose(pose), sigma)[:rows]
 
 

@@ -18,6 +18,7 @@ from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches,
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.mapping import calibration
 from hiosdf_jax._src.network import training
+from hiosdf_jax._src.numerics.posed_cloud import extras_are_valid
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.samples import from_cloud, from_grid
 from hiosdf_jax._src.samples.draw import Samples, concatenate
@@ -100,6 +101,7 @@ def begin(
     flags = jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD) | jnp.where(
         is_rigid(pose), 0, Flag.BAD_POSE
     )
+    flags |= jnp.where(extras_are_valid(robot, noise), 0, Flag.BAD_ARGUMENT)
     key, grid_key, cloud_key, order_key, bound_key = jax.random.split(state.key, 5)
     keys = Keys(bound=bound_key, grid=grid_key, cloud=cloud_key, order=order_key)
     state = state.replace(key=key)
@@ -278,7 +280,7 @@ def run_stages(step: Step, stages: Sequence[Stage]) -> Step:
 
 def is_accepted(step: Step) -> jax.Array:
     """Returns whether the checked cloud is to be fused, () bool."""
-    refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE
+    refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE | Flag.BAD_ARGUMENT
     patient = step.state.report.refused_in_row < step.config.most_refusals
     return ~_has(step, refused) & ~(_has(step, Flag.INCONSISTENT_CLOUD) & patient)
 

@@ -15,6 +15,9 @@ from hiosdf_jax._src.numerics.rigid import is_rigid
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
 
+LEAST_NOISE_M = 1e-4
+"""Smaller noise would give a return a weight that float16 cannot hold."""
+
 
 def check_shapes(cloud: Any, pose: Any) -> None:
     """Checks shapes only, which tracers have as well.
@@ -116,17 +119,31 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
         if shape != (2,):
             raise ValueError(f"noise is {noise!r}, expected two numbers (a, b)")
         floor, growth = noise
-        _check_values("noise a", floor, float(np.finfo(np.float32).tiny))
+        _check_values("noise a", floor, LEAST_NOISE_M)
         _check_values("noise b", growth, 0)
         noise = jnp.stack([jnp.asarray(floor, jnp.float32), jnp.asarray(growth, jnp.float32)])
     return robot, noise
 
 
+def extras_are_valid(
+    robot: tuple[jax.Array, jax.Array] | None, noise: jax.Array | None
+) -> jax.Array:
+    """Returns whether traced `robot` and `noise` have values that `check_extras` accepts, ()."""
+    valid = jnp.asarray(True)
+    if robot is not None:
+        centers, radii = robot
+        valid &= jnp.isfinite(centers).all() & (jnp.isfinite(radii) & (radii >= 0)).all()
+    if noise is not None:
+        least = jnp.asarray([LEAST_NOISE_M, 0.0], jnp.float32)
+        valid &= (jnp.isfinite(noise) & (noise >= least)).all()
+    return valid
+
+
 def _check_values(name: str, values: Any, least: float) -> None:
     if isinstance(values, jax.core.Tracer):
         return
-    array = np.asarray(values, float)
-    if not (np.isfinite(array).all() and (array >= least).all()):
+    array = as_floats(name, values)
+    if not (np.isfinite(array).all() and (array >= np.float32(least)).all()):
         expected = "finite values" if least == -np.inf else f"finite values >= {least:.3g}"
         raise ValueError(
             f"{name} has values from {array.min()} to {array.max()}, expected {expected}"
@@ -209,7 +226,11 @@ def warn_out_of_range(
     warnings.warn(
         f"cloud has {usable} of {len(square)} returns between min_range, {min_range:g} m, and "
         f"max_range, {max_range:g} m; the median range is {middle:.3g} m. The map ignores it. "
-        + ("It looks like millimeters, expected m" if unit != "m" else "Its unit must be m"),
+        + (
+            "It looks like millimeters, expected m"
+            if unit != "m"
+            else f"Its unit must be m; Config.min_in_range is {min_share:g}"
+        ),
         stacklevel=3,
     )
 
