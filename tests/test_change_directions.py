@@ -107,7 +107,7 @@ def test_the_image_against_a_loop(cloud):
 
 
 def square_around(values, at, reach):
-    """The values up to so many pixels away from a pixel; there are none off the edges."""
+    """The values up to `reach` pixels away from a pixel; there are none off the edges."""
     line, column = divmod(at, EDGE)
     values = values.reshape(EDGE, EDGE)
     return values[

@@ -80,14 +80,15 @@ ASIDE = np.add(ALL, [0.3, 0.2])
 QUARTERS = {
     "all": (ALL, 3),
     "three": (ALL[(ALL[:, 0] < 0) | (ALL[:, 1] < 0)], 2),
-    "two": (ALL[ALL[:, 0] < -0.001], 1),
+    "half": (ALL[ALL[:, 0] < -0.001], 2),
+    "two rays": (np.array([[-0.004, 0.003], [0.004, 0.003]]), 1),
 }
 
 
 @pytest.mark.parametrize("name", QUARTERS)
 @pytest.mark.parametrize("scans", [3, 6])
 def test_a_patch_that_rays_cross_vanishes_after_some_scans(name, scans):
-    """A scan of `vanish_scans` is one that crosses three quarters; all count more, two less."""
+    """A scan of `vanish_scans` crosses three quarters, or half by three rays or more."""
     offsets, doubt = QUARTERS[name]
     config = dataclasses.replace(CONFIG, vanish_scans=scans)
     window = patch()
@@ -165,14 +166,14 @@ def test_a_hit_resets_the_count():
 def test_patches_of_few_hits_vanish_sooner():
     config = dataclasses.replace(CONFIG, vanish_scans=6)
     patches = [patch(3, 2), patch(5, 2), patch(5, 4), patch()]  # 6, 10, 20 and 100 hits
-    # 2 ceil(6 hits / 20), at most 12, of which a scan is worth 3 or, with two quarters, 1
+    # 2 ceil(6 hits / 20), at most 12, of which a scan is worth 3 or, with two rays, 1
     assert [scans_until_gone(each, through(ALL), config) for each in patches] == [2, 2, 4, 4]
-    two = through(QUARTERS["two"][0])
+    two = through(QUARTERS["two rays"][0])
     assert [scans_until_gone(each, two, config) for each in patches] == [4, 6, 12, 12]
 
 
 def test_new_surfaces_vanish_at_once():
-    for quarters, gone in (("two", True), ("all", True)):
+    for quarters, gone in (("half", True), ("all", True)):
         new = patch()._replace(change=jnp.zeros(SHAPE, jnp.int8).at[CELL].set(5))
         after, _ = scan(new, through(QUARTERS[quarters][0]))
         assert (state_of(after) == (0, -72)) == gone
@@ -180,6 +181,31 @@ def test_new_surfaces_vanish_at_once():
     for ends in (through(ASIDE), CENTER - [0.2, 0, 0] + 0.001 * through(ALL)):
         kept, _ = scan(new, ends)
         assert state_of(kept) == (100, 5)
+
+
+@pytest.mark.parametrize(
+    ("gone", "left", "vanishes"), [(12, 0, True), (12, 1, False), (7, 0, False)]
+)
+def test_a_patch_that_no_ray_passes_goes_with_its_neighbors(monkeypatch, gone, left, vanishes):
+    """Rays look past it on all sides, but none crosses its voxel."""
+    # From farther away, the patch is small in the image.
+    monkeypatch.setitem(globals(), "SENSOR", np.array([-1.9, 0.55, 0.65]))
+    window = patch()
+    change, hits = np.zeros(SHAPE, np.int8), np.array(window.hits)
+    corners = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 1) for z in (-1, 1)]
+    for step in corners[:gone]:
+        change[tuple(np.add(CELL, step))] = -72
+    if left:  # six patches that stay, since nothing near them has vanished
+        hits[tuple(np.add(CELL, (2, 0, 0)))] = 0
+        for y in (-2, 2):
+            for x in (0, 1, 2):
+                hits[tuple(np.add(CELL, (x, y, 0)))] = 50
+    window = window._replace(change=jnp.asarray(change), hits=jnp.asarray(hits))
+    beside = square(0.12, 25)
+    beside = through(beside[np.abs(beside).max(axis=1) > 0.052])
+    after, before = scan(window, beside)
+    assert float(before.passes[CELL]) == 0
+    assert (state_of(after) == (0, -72)) == vanishes
 
 
 def test_vanished_places_are_forgotten_after_eight_scans_that_pass_them():

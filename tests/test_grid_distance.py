@@ -91,3 +91,47 @@ def test_nearest_sites_off_the_centers_of_voxels_against_a_tree():
     assert np.mean(excess > 1e-4) < 0.02
     assert excess.mean() < 0.005
     assert excess.max() < 1
+
+
+# The center of the one voxel lies half a voxel in front of a plane, or behind it.
+SIGNS = {
+    "in front, no ray": (0.5, 50, 0, 0, 1),
+    "behind, no ray": (-0.5, 50, 0, 0, -1),
+    "behind, some rays": (-0.5, 50, 5, 0, -1),
+    "in front, some rays end before it": (0.5, 50, 1, 5, 1),
+    "in front, all rays end before it": (0.5, 50, 0, 5, -1),
+    "in front, near, all rays end before it": (0.1, 50, 0, 5, 1),
+    "behind, few hits, rays pass": (-0.5, 5, 5, 0, 1),
+    "in front, few hits, rays end before it": (0.5, 5, 0, 1, -1),
+    "few hits, no ray": (-0.5, 5, 0, 0, -1),
+    "far behind": (-4.0, 50, 0, 9, -1),
+    "farther behind than rays mark voxels": (-7.0, 50, 0, 9, 1),
+}
+
+
+@pytest.mark.parametrize("name", SIGNS)
+def test_the_plane_decides_near_a_sure_patch_and_the_rays_elsewhere(name):
+    height, hits, passes, behind, expected = SIGNS[name]
+    shape = (3, 3, 12)
+    here = tuple(jnp.asarray([k]) for k in (1, 1, 8))
+    axes = [jnp.asarray(axis)[:, None] for axis in ([0.4, 0, 0], [0, 0.4, 0], [0, 0, 0.05])]
+    counts = [jnp.zeros(shape).at[1, 1, 8].set(count) for count in (passes, behind)]
+    offset = tuple(jnp.asarray([value]) for value in (0.0, 0.0, height))
+    sure = jnp.asarray([hits >= distance._SURE_HITS])
+    marked = jnp.asarray([abs(height) < distance._HIDDEN_REACH_VOXELS])
+    side = distance._side(*counts, here, offset, tuple(axes[1]), tuple(axes[2]), sure, marked)
+    value = float(side[0]) or 1.0  # no side at all counts as free
+    assert value == expected
+
+
+def test_a_sheet_has_free_space_on_both_sides():
+    shape = (3, 3, 12)
+    here = tuple(jnp.asarray([k]) for k in (1, 1, 4))
+    middle, short = ([0, 0.4, 0], [0, 0, 0.05])
+    middle, short = (tuple(jnp.asarray(axis)[:, None]) for axis in (middle, short))
+    offset = tuple(jnp.asarray([value]) for value in (0.0, 0.0, -0.5))
+    for free, expected in ((0, -1), (5, 1)):
+        passes = jnp.zeros(shape).at[1, 1, 2].set(free)
+        sure = jnp.asarray([True])
+        side = distance._side(passes, jnp.zeros(shape), here, offset, middle, short, sure, sure)
+        assert float(side[0]) == expected

@@ -236,9 +236,15 @@ def test_a_sample_that_is_not_finite_leaves_the_network_as_it_was():
 def test_the_schedule_warms_up_and_queries_never_use_the_untrained_network():
     config = dataclasses.replace(TINY, warmup_updates=3, warmup_epochs=7, epochs=2)
     config = dataclasses.replace(config, weight_average=0.8)
-    made = [training.schedule(config, jnp.int32(n)) for n in range(7)]
+    made = [training.schedule(config, jnp.int32(n), jnp.float32(0.019)) for n in range(7)]
     assert [int(extra) for extra, _ in made] == [5, 5, 5, 0, 0, 0, 0]
     short = dataclasses.replace(config, warmup_epochs=1)
-    assert [int(training.schedule(short, jnp.int32(n))[0]) for n in (2, 3)] == [0, 1]
+    assert [int(training.schedule(short, jnp.int32(n), jnp.float32(0))[0]) for n in (2, 3)] == [
+        0,
+        1,
+    ]
     expected = [0, 1 / 2, 2 / 3, 3 / 4, 4 / 5, 0.8, 0.8]
     np.testing.assert_allclose([float(average) for _, average in made], expected, atol=1e-6)
+    # A changed world: old weights count less.
+    changed = [float(training.schedule(config, jnp.int32(n), 0.02)[1]) for n in (0, 1, 2, 6)]
+    np.testing.assert_allclose(changed, [0, 0.5, 0.5, 0.5], atol=1e-6)

@@ -73,7 +73,9 @@ def jump(setup: Setup) -> Rows:
         late = library.play(early, frames_of(after[SCANS_AFTER:]), name).state
         rng = setup.rng(1)
         figures = (
-            measures.old_place(early, world, [_HANGING], rng)
+            measures.old_place(
+                early, world, [_HANGING], rng, sensor=sensor, scans=after[:SCANS_AFTER]
+            )
             | measures.visible_side(early, after[:SCANS_AFTER], [0])
             | measures.solidity(early, _JUMPED, rng)
             | measures.bounds_hold(
@@ -81,7 +83,9 @@ def jump(setup: Setup) -> Rows:
             )
         )
         # The network has twice the scans.
-        figures["old_network"] = measures.old_place(late, world, [_HANGING], rng)["old_network"]
+        figures["old_network"] = measures.old_place(
+            late, world, [_HANGING], rng, sensor=sensor, scans=after
+        )["old_network"]
         figures["side_network_cm"] = measures.visible_side(late, after, [0])["side_network_cm"]
         rows[name] = figures
     return rows

@@ -27,6 +27,7 @@ _REACHED = 0.9  # of the true distance
 _SEEN_POINTS = 20_000
 _LOOKS = 12  # scans that are searched for the nearest surface of a point
 _VIEW = 0.0125  # rad, as near to a ray a surface counts as seen
+_GAP = 0.0175  # rad, half the gap between the rings of the LiDAR: nothing between them is unseen
 _TOUCH = 0.01  # m, a ray that comes as near to a point has met it
 _DIFFERENCE = 1e-5  # m
 _WAKE_POINTS = 20_000
@@ -111,8 +112,12 @@ def old_place(
     things: Sequence[Thing],
     rng: np.random.Generator,
     least: float = 0.0,
+    sensor: Sensor | None = None,
+    scans: Sequence[Scan] = (),
 ) -> Figures:
     """Scores the place that a thing has left.
+
+    Nothing can be known of a part of it that lies outside a sensor's field of view.
 
     Args:
         state: The map.
@@ -120,12 +125,17 @@ def old_place(
         things: The parts of the thing where they were.
         rng: Source of randomness.
         least: m, points nearer to any surface do not count.
+        sensor: The sensor that looked there; by default all of the place counts.
+        scans: Its scans of the world as it is now.
 
     Returns:
         `old`, `old_lower` and `old_network`, the shares of the place where the map, its lower bound
         and the network alone reach 90 % of the true distance.
     """
     points = np.concatenate([draw_inside(each, _OLD_PLACE_POINTS, 0.0, rng) for each in things])
+    if sensor is not None:
+        poses = [each.pose for each in scans]
+        points = points[is_visible(sensor, poses, world, points, _GAP)]
     truth = world.distance(points)
     points, needed = points[truth >= least], _REACHED * truth[truth >= least]
     return {
@@ -170,17 +180,19 @@ def is_visible(
     poses: Sequence[np.ndarray],
     world: World,
     points: np.ndarray,
+    view: float = _VIEW,
 ) -> np.ndarray:
-    """Returns a mask of the surface points that a sensor sees from one of some poses.
+    """Returns a mask of the points, on surfaces or in free space, that a sensor sees.
 
     Args:
         sensor: The sensor.
         poses: (4, 4) T_world_sensor each.
         world: The world.
-        points: (n, 3) m, on surfaces.
+        points: (n, 3) m.
+        view: rad, the largest angle between a point and a ray.
 
     Returns:
-        (n,) bool.
+        (n,) bool; seen from one pose suffices.
     """
     tree = KDTree(sensor.directions)
     visible = np.full(len(points), False)
@@ -188,7 +200,7 @@ def is_visible(
         rays = points - pose[:3, 3]
         ranges = np.linalg.norm(rays, axis=1)
         directions = rays / np.maximum(ranges, 1e-9)[:, None]
-        in_view = tree.query(directions @ pose[:3, :3])[0] < _VIEW
+        in_view = tree.query(directions @ pose[:3, :3])[0] < view
         visible |= in_view & (world.cast(pose[:3, 3], directions)[0] > ranges - _TOUCH)
     return visible
 

@@ -53,8 +53,7 @@ class Config:
         evidence_limit: Rays that a voxel remembers; older evidence fades beyond that.
         vanish_scans: Scans that must look through most of a surface patch, without a hit between
             them, before it vanishes. Patches of few hits need fewer scans. A scan with rays through
-            all of a patch counts 1.5 times, a scan with rays through half of it (one ring of a
-            LiDAR) 0.5 times.
+            all of a patch counts 1.5 times, a scan with two rays through half of it 0.5 times.
         distance_horizon: Largest distance to a patch that the grid resolves, m; <= 127 voxels.
         frontier_horizon: Largest distance to unseen space that the grid resolves, m.
 

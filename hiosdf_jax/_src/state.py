@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -16,6 +16,10 @@ NO_FEATURE = -128
 
 FRONTIER_STEPS = 127
 """`Derived.frontier_steps` counts steps; the frontier horizon is this many steps long."""
+
+
+Unknown = Literal["network", "obstacle"]
+"""Policies for unseen space: the map's prediction there, or solid."""
 
 
 def frontier_step_m(config: Config) -> float:

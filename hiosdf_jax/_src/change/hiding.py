@@ -103,9 +103,8 @@ def hide_behind(
         unsure = jnp.where(measured.farthest >= 0, -jnp.inf, filled.farthest)
         seen_past = jnp.where(jnp.isfinite(filled.nearest), filled.nearest, -jnp.inf)
 
-        voxels = jnp.meshgrid(*map(jnp.arange, window.hits.shape), indexing="ij")
-        index = window.start + jnp.stack(voxels, axis=-1)
-        offset = split(geometry.voxel_center(config, index) - rays.sensor_world)
+        center_world = geometry.window_centers(config, window.start, window.hits.shape)
+        offset = split(center_world - rays.sensor_world)
         distance, pixel = length(offset), directions.pixel_of(offset)
         behind = (new[pixel] < distance - 0.5 * size) & (new[pixel] > distance - _HIDES_M)
         sure = unsure[pixel] < distance - 0.5 * size

@@ -28,8 +28,7 @@ def clear_robot(
     Returns:
         The window; cleared voxels are free.
     """
-    voxels = jnp.meshgrid(*map(jnp.arange, window.hits.shape), indexing="ij")
-    voxel_world = geometry.voxel_center(config, window.start + jnp.stack(voxels, axis=-1))
+    voxel_world = geometry.window_centers(config, window.start, window.hits.shape)
     center = each(
         lambda v, m: (v + m.astype(jnp.float32) * config.voxel_size).ravel(),
         split(voxel_world),

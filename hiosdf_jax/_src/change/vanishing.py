@@ -29,9 +29,11 @@ _LEAST_HALF_VOXELS = 0.15
 # Rays that graze a patch may pass beside it.
 _LEAST_COSINE = 0.2
 
-# A scan counts by the quarters of a patch that its rays cross: 1 for two, such as those of one ring
-# of a LiDAR, 3 for all. A scan of `vanish_scans` is worth this many.
+# A scan counts by the quarters of a patch that its rays cross: 3 for all, 2 for three, 1 for two.
+# Two count 2 if several rays cross them, such as a ring of a LiDAR. A scan of `vanish_scans` is
+# worth this many.
 _DOUBT_PER_SCAN = 2
+_SEVERAL_RAYS = 3
 
 # `Evidence.change` of a voxel that has just vanished, and where that is forgotten again: until then
 # the network learns such places first.
@@ -42,6 +44,10 @@ _FORGOTTEN = -64
 # in a world that stands still: with 2 of 26 neighbors, 0.61 instead of 0.59 cm on a LiDAR stream.
 _LEAST_GONE_NEIGHBORS = 8
 _SPREADS = 3  # in one scan
+
+# A patch whose voxel no ray passes goes only if this many times as many neighbors have vanished as
+# are left.
+_LEAST_GONE_RATIO = 2
 
 # Hits of a surface that is as sure as it can be; one of fewer hits vanishes sooner.
 _SURE_HITS = 20.0
@@ -78,7 +84,8 @@ def drop_vanished(
     change = jnp.where(forgetting, later, change)
     change = change.astype(jnp.int8)
     window = window._replace(change=change)
-    suspects = (window.hits > 0) & ~hit & (passed | (change > 0))
+    looked_at = passed | (change > 0)
+    suspects = (window.hits > 0) & ~hit & (looked_at | _is_near(change < _FORGOTTEN))
     voxels = suspects.size
     # Where there are too many, each scan judges other slices of the window: none waits forever.
     most = min(_MOST_SUSPECTS, math.ceil(_SUSPECT_SHARE * voxels))
@@ -88,12 +95,12 @@ def drop_vanished(
     (voxel,) = jnp.nonzero(suspects.ravel(), size=most, fill_value=voxels)
     row = jnp.minimum(voxel, voxels - 1)
 
-    quarters, looked_past = _look(config, window, rays, view, row)
     old = change.ravel()[row].astype(jnp.int32)
+    crossed, looked_past = _look(config, window, rays, view, row)
     hits = window.hits.ravel()[row]
-    doubt = jnp.where(old > 0, 0, -old) + jnp.maximum(quarters - 1, 0)
+    doubt = jnp.where(old > 0, 0, -old) + crossed
     needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
-    vanished = ((quarters > 1) & (doubt >= needed)) | ((old > 0) & looked_past)
+    vanished = ((crossed > 0) & (doubt >= needed)) | ((old > 0) & looked_past)
     counted = jnp.where(old > 0, old, -jnp.minimum(doubt, -_FORGOTTEN))
 
     def put(array: jax.Array, values: jax.Array) -> jax.Array:
@@ -105,11 +112,15 @@ def drop_vanished(
     def spread(vanished: jax.Array) -> jax.Array:
         """Adds what is left of a thing: edges that few rays meet go with it."""
         around, inside = _around(change.shape, row)
+        mapped = inside & (window.hits.ravel()[around] > 0)
 
         def once(_: jax.Array, vanished: jax.Array) -> jax.Array:
-            gone = put(change, jnp.where(vanished, _GONE, counted)).ravel() < _FORGOTTEN
-            remains = jnp.sum(inside & gone[around], axis=1) >= _LEAST_GONE_NEIGHBORS
-            return vanished | (remains & ((quarters > 1) | looked_past))
+            gone = put(change, jnp.where(vanished, _GONE, counted)).ravel()[around] < _FORGOTTEN
+            count = jnp.sum(inside & gone, axis=1)
+            left = jnp.sum(mapped & ~gone, axis=1)
+            most = looked_at.ravel()[row] | (count >= _LEAST_GONE_RATIO * left)
+            remains = (count >= _LEAST_GONE_NEIGHBORS) & most
+            return vanished | (remains & ((crossed > 0) | looked_past))
 
         return jax.lax.fori_loop(0, _SPREADS, once, vanished)
 
@@ -117,6 +128,16 @@ def drop_vanished(
     vanished = jax.lax.cond(many, spread, lambda vanished: vanished, vanished)
     window = window._replace(change=put(change, counted))
     return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
+
+
+def _is_near(gone: jax.Array) -> jax.Array:
+    """Returns a mask of the voxels at most one voxel away from vanished ones."""
+
+    def grow(gone: jax.Array) -> jax.Array:
+        ones = 3 * (1,)
+        return jax.lax.reduce_window(gone, False, jnp.logical_or, 3 * (3,), ones, "SAME")
+
+    return jax.lax.cond(jnp.any(gone), grow, lambda gone: gone, gone)
 
 
 def _around(shape: tuple[int, ...], row: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -142,7 +163,7 @@ def is_recent(change: jax.Array) -> jax.Array:
 def _look(
     config: Config, window: EvidenceWindow, rays: Rays, view: View, row: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts the quarters of patches that rays cross, and finds those that all rays see past."""
+    """Counts what a scan says against patches, and finds those that all rays see past."""
     size, shape = config.voxel_size, window.hits.shape
     index = jnp.stack(jnp.unravel_index(row, shape), axis=-1)
     mean = take(window.mean.reshape(-1, 3), row)
@@ -196,4 +217,5 @@ def _look(
         for low in (False, True):
             met = crosses & ((u < 0) == left) & ((v < 0) == low)
             quarters += jnp.any(met, axis=-1)
-    return quarters, past
+    several = (quarters == 2) & (jnp.sum(crosses, axis=-1) >= _SEVERAL_RAYS)
+    return jnp.where(several, 2, jnp.maximum(quarters - 1, 0)), past

@@ -15,14 +15,15 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Bounds, Config
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.network import siren
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state import Field, Unknown
 
 # The grid's answer fades out between these shares of its horizon.
 _FADE = (0.8, 1.0)
 
 # It fades out at these distances beyond observed space, voxels: space just behind a surface is
-# certainly solid.
-_FADE_UNSEEN_VOXELS = (1.0, 3.0)
+# certainly solid. Where unseen space is an obstacle, the frontier bounds the grid's guess, and a
+# guess of the network could hold a point inside a solid.
+_FADE_UNSEEN_VOXELS = {"network": (1.0, 3.0), "obstacle": (2.0, 4.0)}
 
 # Largest correction of the grid by the network, voxels: in unseen space the network is a guess.
 _LARGEST_CORRECTION_VOXELS = 1.0
@@ -42,12 +43,13 @@ def bounds(field: Field) -> Bounds:
     return field.config.bounds
 
 
-def sdf(field: Field, points_world: jax.Array) -> jax.Array:
+def sdf(field: Field, points_world: jax.Array, unknown: Unknown) -> jax.Array:
     """Computes the blended signed distance.
 
     Args:
         field: The field.
         points_world: (..., 3) m, inside the bounds.
+        unknown: The policy for unseen space that the distance is for.
 
     Returns:
         (...) m. Differentiable.
@@ -57,7 +59,7 @@ def sdf(field: Field, points_world: jax.Array) -> jax.Array:
     if config.grid_share == 0:
         return network
     grid = lookup.grid_sdf(config, field.surface, points_world)
-    return _combine(config, grid, network, frontier(field, points_world))
+    return _combine(config, grid, network, frontier(field, points_world), unknown)
 
 
 def frontier(field: Field, points_world: jax.Array) -> jax.Array:
@@ -126,13 +128,15 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
     doubt = lookup.doubt_distance(config, field.surface, points_world)
     unseen = frontier(field, points_world)
-    cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen), doubt)
+    cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen, "network"), doubt)
     # Unseen space may hide a surface that is nearer than all observed ones.
     hidden = jnp.maximum(unseen, cautious - _HIDDEN_VOXELS * config.voxel_size)
     return jnp.minimum(cautious, hidden), scale
 
 
-def _combine(config: Config, grid: jax.Array, network: jax.Array, frontier: jax.Array) -> jax.Array:
+def _combine(
+    config: Config, grid: jax.Array, network: jax.Array, frontier: jax.Array, unknown: Unknown
+) -> jax.Array:
     """Blends the distances of grid and network."""
     if config.grid_share == 0:
         return network
@@ -141,6 +145,6 @@ def _combine(config: Config, grid: jax.Array, network: jax.Array, frontier: jax.
     near = grid + (1 - config.grid_share) * jnp.clip(network - grid, -limit, limit)
     start, end = (share * config.distance_horizon for share in _FADE)
     far = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)
-    start, end = (voxels * config.voxel_size for voxels in _FADE_UNSEEN_VOXELS)
+    start, end = (voxels * config.voxel_size for voxels in _FADE_UNSEEN_VOXELS[unknown])
     unseen = jnp.clip((-frontier - start) / (end - start), 0, 1)
     return near + jnp.maximum(far, unseen) * (network - near)

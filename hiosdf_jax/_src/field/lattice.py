@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.state import Baked
+from hiosdf_jax._src.state import Baked, Unknown
 
 _MOST_SAMPLES = 2**31 - 1
 
@@ -23,8 +23,12 @@ def bounds(baked: Baked) -> tuple[jax.Array, jax.Array]:
     return baked.corner_world, baked.corner_world + last * baked.resolution
 
 
-def sdf(baked: Baked, points_world: jax.Array) -> jax.Array:
-    """Interpolates the signed distance at points (..., 3) m inside the box; (...) m."""
+def sdf(baked: Baked, points_world: jax.Array, unknown: Unknown) -> jax.Array:
+    """Interpolates the signed distance at points (..., 3) m inside the box; (...) m.
+
+    The samples are the same for each policy for unseen space.
+    """
+    del unknown
     return interpolate(baked, baked.sdf, points_world)
 
 

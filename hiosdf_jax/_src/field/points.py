@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.field import blend, lattice
 from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.state import Baked, Field, MapState, Query, field_of
+from hiosdf_jax._src.state import Baked, Field, MapState, Query, Unknown, field_of
 
 _FAR = 1e30  # m
 
@@ -21,7 +21,6 @@ _FAR = 1e30  # m
 _DEEP_M = 0.4
 
 AnyField = MapState | Field | Baked
-Unknown = Literal["network", "obstacle"]
 
 
 def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array:
@@ -35,7 +34,8 @@ def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array
         points: (..., 3) m, world frame.
         unknown: Policy for unseen space. "network" returns the map's prediction there. "obstacle"
             treats unseen space as solid: the result is min(sdf, frontier) in observed space and,
-            from 40 cm deep in unseen space on, the frontier's negative distance alone.
+            from 40 cm deep in unseen space on, the frontier's negative distance alone. Between
+            them the grid's guess counts more than the network's.
 
     Returns:
         (...) float32, m; positive in free space, negative behind surfaces. Differentiable.
@@ -133,7 +133,7 @@ def _distance_and_grad(
 @_compiled
 def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown) -> jax.Array:
     place = _place(field, points)
-    value = _answers_of(field).sdf(field, place.nearest)
+    value = _answers_of(field).sdf(field, place.nearest, unknown)
     value = value + jnp.where(jnp.any(jnp.isnan(points), axis=-1), -place.beyond, place.beyond)
     if unknown == "network":
         return value

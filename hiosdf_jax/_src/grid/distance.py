@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
+from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
@@ -30,6 +31,18 @@ _SHEET_VOXELS = 2.0
 
 # Where no ray passed, the plane of a patch decides the side up to this distance, voxels.
 _GUESS_VOXELS = 3.0
+
+# The plane of a patch of fewer hits is uncertain: its normal may face away from the sensor.
+_SURE_HITS = 10.0
+
+# No ray passes a voxel behind a surface, and this many end before it. The plane may run through it,
+# so the voxel's center must be this far from the plane, voxels.
+_BLOCKED_RAYS = 3.0
+_BLOCKED_VOXELS = 0.2
+
+# Rays mark voxels up to this far behind their ends, those of grazing rays farthest. Where no hits
+# are so near, the surface that the rays ended on has vanished.
+_HIDDEN_REACH_VOXELS = HIDDEN_VOXELS + 2.0
 
 # Shifts in either direction between two optimization barriers.
 _CHUNK = 8
@@ -190,7 +203,9 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     long, middle, short = (take(spans, row, first) for first in (0, 3, 6))
     patch = each(jnp.add, take(means, row), jump)
     offset = patches.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
-    side = _side(is_free(passes, behind), behind, here, offset, middle, short)
+    sure = hits.ravel()[row] >= _SURE_HITS
+    marked = squared.ravel() < _HIDDEN_REACH_VOXELS**2
+    side = _side(passes, behind, here, offset, middle, short, sure, marked)
     signed_m = side * length(offset) * config.voxel_size
     sdf = jnp.where(found, signed_m, config.distance_horizon)
     jump = jnp.where(found[..., None], join(jump), NO_FEATURE)
@@ -221,32 +236,38 @@ def is_free(passes: jax.Array, behind: jax.Array) -> jax.Array:
 
 
 def _side(
-    free: jax.Array,
+    passes: jax.Array,
     behind: jax.Array,
     here: Vector,
     offset: Vector,
     middle: Vector,
     short: Vector,
+    sure: jax.Array,
+    marked: jax.Array,
 ) -> jax.Array:
     """Computes the sign of voxels' centers: +1 in free space, -1 behind surfaces.
 
     Away from surfaces the rays through the voxel decide. Rays end within a voxel of a flat patch,
     so there the side of its plane decides, unless the patch is a sheet with free space on both
-    sides.
+    sides. The rays decide there too where the plane is uncertain, or where all of them end before
+    the voxel.
 
     Args:
-        free: Result of `is_free` in the window, (X, Y, Z) bool.
+        passes: Rays that went through the window's voxels, (X, Y, Z).
         behind: Rays that ended a little before the window's voxels, (X, Y, Z).
         here: Indices of the voxels in the window, (N,) each.
         offset: From the nearest point of the nearest patch to the center, (N,) each, voxels.
         middle: The second principal axis of that patch, (N,) each.
         short: Its third axis, along the normal, (N,) each.
+        sure: That patch has enough hits for a plane, (N,) bool.
+        marked: The center is so near to some hits that `behind` may be due to them, (N,) bool.
 
     Returns:
         (N,) float32.
     """
-    shape = free.shape
-    free, behind = free.ravel(), behind.ravel()
+    shape = passes.shape
+    passes, behind = passes.ravel(), behind.ravel()
+    free = is_free(passes, behind)
     distance, thickness = length(offset), length(short)
     flat = thickness < 0.5 * length(middle)
     normal = each(lambda a: a / jnp.maximum(thickness, 1e-6), short)
@@ -256,6 +277,8 @@ def _side(
     by_plane = in_front | free[geometry.flat_index(shape, probe)]
     own = geometry.flat_index(shape, here)
     unobserved = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
-    by_rays = jnp.where(behind[own] > 0, -1.0, unobserved)
+    by_rays = jnp.where((behind[own] > 0) & marked, -1.0, unobserved)
     by_rays = jnp.where(free[own], 1.0, by_rays)
-    return jnp.where(flat & (distance < 1), jnp.where(by_plane, 1.0, -1.0), by_rays)
+    blocked = (passes[own] <= 0) & (behind[own] >= _BLOCKED_RAYS) & (distance > _BLOCKED_VOXELS)
+    trusted = flat & sure & (distance < 1) & ~blocked
+    return jnp.where(trusted, jnp.where(by_plane, 1.0, -1.0), by_rays)

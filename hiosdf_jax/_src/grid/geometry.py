@@ -75,6 +75,12 @@ def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     return (index_world.astype(jnp.float32) + 0.5) * config.voxel_size
 
 
+def window_centers(config: Config, start: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Returns the centers of all voxels of a window, (X, Y, Z, 3) m, world frame."""
+    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij"), axis=-1)
+    return voxel_center(config, start + index)
+
+
 def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:
     """Converts indices (...) into an array of this shape to indices into the raveled array."""
     return (index[0] * shape[1] + index[1]) * shape[2] + index[2]

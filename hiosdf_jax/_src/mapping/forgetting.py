@@ -49,8 +49,7 @@ def forget(state: MapState, box: Any) -> MapState:
 
 @jax.jit(static_argnums=0)
 def _forget(config: Config, grid: Grid, corners: jax.Array) -> Grid:
-    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, config.grid_shape), indexing="ij"), axis=-1)
-    center_world = geometry.voxel_center(config, index)
+    center_world = geometry.window_centers(config, jnp.zeros(3, jnp.int32), config.grid_shape)
     inside = jnp.all((center_world >= corners[0]) & (center_world <= corners[1]), axis=-1)
 
     def clear(known: jax.Array, empty: jax.Array) -> jax.Array:

@@ -214,7 +214,9 @@ def sample_cloud(step: Step) -> Step:
 
 def train(step: Step) -> Step:
     """Fits the network to the samples (IV-D)."""
-    extra_epochs, average = training.schedule(step.config, step.state.updates)
+    known = step.state.grid.evidence
+    changed = jnp.sum(vanishing.is_recent(known.change)) / jnp.maximum(jnp.sum(known.hits > 0), 1)
+    extra_epochs, average = training.schedule(step.config, step.state.updates, changed)
     network, losses, trained = training.train(
         step.config, step.state.network, step.samples, extra_epochs, average, step.keys.order
     )

@@ -15,6 +15,11 @@ from hiosdf_jax._src.network import forward, siren, tiles
 from hiosdf_jax._src.samples.draw import Samples
 from hiosdf_jax._src.state import Network
 
+# Where at least this share of the surface is new or has vanished, the old weights are those of
+# another world: the average then keeps at most this share of them.
+_CHANGED_WORLD = 0.02
+_CHANGED_AVERAGE = 0.5
+
 
 class Losses(NamedTuple):
     """The two parts of the loss, before their weights.
@@ -67,21 +72,25 @@ def least_epochs(config: Config) -> int:
     return min(config.epochs, config.warmup_epochs)
 
 
-def schedule(config: Config, updates: jax.Array) -> tuple[jax.Array, jax.Array]:
+def schedule(config: Config, updates: jax.Array, changed: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Computes how an update trains the network.
 
     Args:
         config: The map's configuration.
         updates: Number of earlier updates, () int32.
+        changed: Number of voxels where a surface has just appeared or vanished, as a share of all
+            voxels with a surface, ().
 
     Returns:
         extra_epochs: Epochs beyond `least_epochs`, () int32.
         average: Share of the old weights in the average, (). Over the first updates it is a running
-            mean, so that queries never use the untrained network.
+            mean, so that queries never use the untrained network. After a change it is smaller.
     """
     epochs = jnp.where(updates < config.warmup_updates, config.warmup_epochs, config.epochs)
     extra_epochs = epochs - least_epochs(config)
-    return extra_epochs, jnp.minimum(config.weight_average, updates / (updates + 1.0))
+    most = jnp.where(changed >= _CHANGED_WORLD, _CHANGED_AVERAGE, 1.0)
+    average = jnp.minimum(config.weight_average, updates / (updates + 1.0))
+    return extra_epochs, jnp.minimum(average, most)
 
 
 def train(
