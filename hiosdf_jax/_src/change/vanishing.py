@@ -14,6 +14,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
 
 # Patches that one scan can judge, and the same as a share of the window's voxels; the others are
@@ -134,8 +135,10 @@ def _is_near(gone: jax.Array) -> jax.Array:
     """Returns a mask of the voxels at most one voxel away from vanished ones."""
 
     def grow(gone: jax.Array) -> jax.Array:
-        ones = 3 * (1,)
-        return jax.lax.reduce_window(gone, False, jnp.logical_or, 3 * (3,), ones, "SAME")
+        for axis in range(3):
+            padded = pad_axis(gone, axis, 1, False)
+            gone = gone | padded.shifted(-1) | padded.shifted(1)
+        return gone
 
     return jax.lax.cond(jnp.any(gone), grow, lambda gone: gone, gone)
 
