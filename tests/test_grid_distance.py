@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from hiosdf_jax._src.grid import distance
+from hiosdf_jax._src.state import Side
 
 
 def nearest_sites(sites, offset, horizon, part=None):
@@ -119,9 +120,12 @@ def test_the_plane_decides_near_a_sure_patch_and_the_rays_elsewhere(name):
     offset = tuple(jnp.asarray([value]) for value in (0.0, 0.0, height))
     sure = jnp.asarray([hits >= distance._SURE_HITS])
     marked = jnp.asarray([abs(height) < distance._HIDDEN_REACH_VOXELS])
-    side = distance._side(*counts, here, offset, tuple(axes[1]), tuple(axes[2]), sure, marked)
-    value = float(side[0]) or 1.0  # no side at all counts as free
+    sign, side = distance._side(*counts, here, offset, *map(tuple, axes[1:]), sure, marked)
+    value = float(sign[0]) or 1.0  # no side at all counts as free
     assert value == expected
+    by_plane = hits >= distance._SURE_HITS and abs(height) < 1 and "all rays" not in name
+    by_plane |= name == "in front, near, all rays end before it"
+    assert int(side[0]) == (Side.PLANE if by_plane else int(sign[0]))
 
 
 def test_a_sheet_has_free_space_on_both_sides():
@@ -133,5 +137,8 @@ def test_a_sheet_has_free_space_on_both_sides():
     for free, expected in ((0, -1), (5, 1)):
         passes = jnp.zeros(shape).at[1, 1, 2].set(free)
         sure = jnp.asarray([True])
-        side = distance._side(passes, jnp.zeros(shape), here, offset, middle, short, sure, sure)
-        assert float(side[0]) == expected
+        sign, side = distance._side(
+            passes, jnp.zeros(shape), here, offset, middle, short, sure, sure
+        )
+        assert float(sign[0]) == expected
+        assert int(side[0]) == (Side.SHEET if free else Side.PLANE)

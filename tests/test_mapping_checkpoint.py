@@ -9,6 +9,7 @@ import pytest
 from room import arrays_equal, stream
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.grid.distance import recompute_distances
 
 
 def test_a_loaded_map_continues_bit_by_bit(room_map, tmp_path):
@@ -73,12 +74,12 @@ def test_load_names_what_is_wrong(room_map, tmp_path):
     with pytest.raises(ValueError, match=r"has grid\.hits of float16"):
         hio.load(path)
     for version in (1, 99):
-        other = str(arrays["header"]).replace('"version": 3', f'"version": {version}')
+        other = str(arrays["header"]).replace('"version": 4', f'"version": {version}')
         np.savez(path, **(arrays | {"header": np.asarray(other)}))
-        with pytest.raises(ValueError, match=f"format version {version}, expected 2 or 3"):
+        with pytest.raises(ValueError, match=f"format version {version}, expected 2 to 4"):
             hio.load(path)
-    # Only files of version 2 may lack what version 3 has added.
-    for name in NEW_ARRAYS:
+    # Only files of older versions may lack what newer ones have added.
+    for name in (*NEW_ARRAYS, "grid.surface.side"):
         short = {known: array for known, array in arrays.items() if known != name}
         np.savez(path, **short)
         with pytest.raises(ValueError, match=f"lacks the array {name}"):
@@ -187,10 +188,6 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
         "grid.behind": evidence.behind,
         "grid.weight": evidence.root_weight,
         "grid.surface.mean": evidence.mean,
-        "grid.surface.axes": evidence.axes,
-        "grid.surface.nearest": derived.nearest,
-        "grid.surface.sdf": derived.sdf,
-        "grid.surface.doubt": derived.doubt,
         "grid.surface.frontier": derived.frontier_steps,
         "network.params.params.Dense_1.kernel": network.params["params"]["Dense_1"]["kernel"],
         "network.served.params.Dense_1.kernel": network.average["params"]["Dense_1"]["kernel"],
@@ -208,6 +205,12 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
     }
     for name, array in places.items():
         np.testing.assert_array_equal(array, arrays[name], err_msg=name)
+    # The axes become right-handed, and the distances of older files are computed anew.
+    axes, before = np.asarray(evidence.axes, float), np.asarray(arrays["grid.surface.axes"], float)
+    assert (np.linalg.det(axes) > 0).all()
+    assert (axes[..., 1, :] != before[..., 1, :]).any()
+    np.testing.assert_array_equal(np.abs(axes), np.abs(before))
+    assert arrays_equal(recompute_distances(state.config, state.grid).derived, derived)
     report = state.report
     new = (evidence.change, report.points_moving, report.refused_in_row, report.update_flags)
     for array, (shape, dtype) in zip(new, NEW_ARRAYS.values(), strict=True):
@@ -215,11 +218,12 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
         assert not np.asarray(array).any()
 
 
-def test_a_map_of_version_2_continues_as_one_of_version_3(room_map, tmp_path):
+def test_a_map_of_version_2_continues_as_one_of_the_current_version(room_map, tmp_path):
     """A map in which nothing has changed lacks nothing but zeros."""
     hio.save(tmp_path / "new.npz", room_map)
     with np.load(tmp_path / "new.npz") as file:
-        arrays = {name: file[name] for name in file.files if name not in NEW_ARRAYS}
+        newer = (*NEW_ARRAYS, "grid.surface.side")
+        arrays = {name: file[name] for name in file.files if name not in newer}
     header = json.loads(str(arrays.pop("header"))) | {"version": 2}
     for name in NEW_FIELDS:  # those of this map are the defaults
         del header["config"][name]
@@ -260,6 +264,7 @@ def test_a_file_of_format_version_3_keeps_its_changes(tmp_path):
 def test_names_in_a_file_do_not_change(tmp_path):
     """They are part of its format; attributes of the code may be renamed."""
     header, arrays = file_of_version_3()
+    header["version"], arrays["grid.surface.side"] = 4, np.zeros((4, 3, 2), np.int8)
     config = hio.Config(**header["config"])
     hio.save(tmp_path / "map.npz", hio.init(config, jax.random.key(0)))
     with np.load(tmp_path / "map.npz") as file:

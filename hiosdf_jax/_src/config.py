@@ -13,7 +13,7 @@ Bounds = tuple[Point, Point]
 # Bounds that are multiples of the voxel size must not gain a voxel from rounding (0.3 / 0.1 < 3).
 _TOLERANCE_VOXELS = 1e-4
 
-# An int32 counts the nine numbers of each voxel's principal axes. Such a map has 9.8 GB.
+# An int32 counts the nine numbers of each voxel's principal axes. Such a map has 10 GB.
 _MOST_VOXELS = (2**31 - 1) // 9
 
 

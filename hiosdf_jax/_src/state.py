@@ -94,7 +94,8 @@ class Evidence(flax.struct.PyTreeNode):
             weights of far returns are too small for float16.
         mean: Weighted mean of the hits, (X, Y, Z, 3) float16.
         axes: Principal axes of the hits, longest first, each as long as the standard deviation
-            along it, (X, Y, Z, 3, 3) float16. The last one is the normal, on the sensor's side.
+            along it, right-handed, (X, Y, Z, 3, 3) float16. The last one is the normal, on the
+            sensor's side.
         change: Recent changes, (X, Y, Z) int8. k > 0: a surface appeared in free space and counts
             as new for k more scans that see it. -64 <= k < 0: rays have crossed the patch since its
             last hit; see `change.vanishing`. k < -64: it vanished, and counts as recent for -64 - k
@@ -110,6 +111,21 @@ class Evidence(flax.struct.PyTreeNode):
     change: jax.Array
 
 
+class Side(enum.IntEnum):
+    """What decides the sign of distances around a voxel."""
+
+    BEHIND = -1
+    """Rays end before the voxel: it is negative."""
+    UNKNOWN = 0
+    """No ray and no patch nearby shows its side."""
+    FREE = 1
+    """Rays go through the voxel."""
+    PLANE = 2
+    """The plane of its nearest patch, which lies right beside the voxel's center."""
+    SHEET = 3
+    """The same, but the patch has free space on both sides."""
+
+
 class Derived(flax.struct.PyTreeNode):
     """Distances of each voxel, derived from the evidence around it.
 
@@ -117,6 +133,7 @@ class Derived(flax.struct.PyTreeNode):
         nearest: Offset in whole voxels to the voxel of the nearest surface patch,
             (X, Y, Z, 3) int8; NO_FEATURE where there is none within the horizon.
         sdf: Signed distance of the voxel's center to that patch, m, (X, Y, Z) float16.
+        side: What decides the sign around the voxel, (X, Y, Z) int8: `Side`.
         doubt: Distance of the voxel's center to the nearest voxel in which any ray has ended and
             that is not almost certainly free, m, (X, Y, Z) float16. Carved surfaces and surfaces
             that were hit once count.
@@ -127,6 +144,7 @@ class Derived(flax.struct.PyTreeNode):
 
     nearest: jax.Array
     sdf: jax.Array
+    side: jax.Array
     doubt: jax.Array
     frontier_steps: jax.Array
 

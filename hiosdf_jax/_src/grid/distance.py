@@ -18,7 +18,7 @@ from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
-from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid
+from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid, Side
 
 _INFINITE = 1e12  # squared voxels
 
@@ -34,6 +34,10 @@ _GUESS_VOXELS = 3.0
 
 # The plane of a patch of fewer hits is uncertain: its normal may face away from the sensor.
 _SURE_HITS = 10.0
+
+# A patch fills its voxel or lies beside it where the nearest point to the voxel's center is at most
+# this far along its plane, voxels. Farther on is the edge of a surface, where the rays decide.
+_BESIDE_VOXELS = 0.15
 
 # No ray passes a voxel behind a surface, and this many end before it. The plane may run through it,
 # so the voxel's center must be this far from the plane, voxels.
@@ -205,8 +209,8 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     offset = patches.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
     sure = hits.ravel()[row] >= _SURE_HITS
     marked = squared.ravel() < _HIDDEN_REACH_VOXELS**2
-    side = _side(passes, behind, here, offset, middle, short, sure, marked)
-    signed_m = side * length(offset) * config.voxel_size
+    sign, side = _side(passes, behind, here, offset, middle, short, sure, marked)
+    signed_m = sign * length(offset) * config.voxel_size
     sdf = jnp.where(found, signed_m, config.distance_horizon)
     jump = jnp.where(found[..., None], join(jump), NO_FEATURE)
 
@@ -218,6 +222,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     return known.replace(
         nearest=write(known.nearest, jump),
         sdf=write(known.sdf, sdf),
+        side=write(known.side, jnp.where(found, side, Side.UNKNOWN)),
         doubt=write(known.doubt, doubt),
     )
 
@@ -244,7 +249,7 @@ def _side(
     short: Vector,
     sure: jax.Array,
     marked: jax.Array,
-) -> jax.Array:
+) -> tuple[jax.Array, jax.Array]:
     """Computes the sign of voxels' centers: +1 in free space, -1 behind surfaces.
 
     Away from surfaces the rays through the voxel decide. Rays end within a voxel of a flat patch,
@@ -263,7 +268,8 @@ def _side(
         marked: The center is so near to some hits that `behind` may be due to them, (N,) bool.
 
     Returns:
-        (N,) float32.
+        sign: (N,) float32; 0 where nothing decides.
+        side: What decides, (N,) int8, see `Side`.
     """
     shape = passes.shape
     passes, behind = passes.ravel(), behind.ravel()
@@ -271,14 +277,21 @@ def _side(
     distance, thickness = length(offset), length(short)
     flat = thickness < 0.5 * length(middle)
     normal = each(lambda a: a / jnp.maximum(thickness, 1e-6), short)
-    in_front = dot(offset, normal) >= 0
+    height = dot(offset, normal)
+    in_front = height >= 0
     beyond = each(lambda h, o, n: h - o - _SHEET_VOXELS * n, here, offset, normal)
     probe = each(lambda b, n: jnp.clip(jnp.round(b).astype(jnp.int32), 0, n - 1), beyond, shape)
-    by_plane = in_front | free[geometry.flat_index(shape, probe)]
+    sheet = free[geometry.flat_index(shape, probe)]
     own = geometry.flat_index(shape, here)
     unobserved = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
     by_rays = jnp.where((behind[own] > 0) & marked, -1.0, unobserved)
     by_rays = jnp.where(free[own], 1.0, by_rays)
     blocked = (passes[own] <= 0) & (behind[own] >= _BLOCKED_RAYS) & (distance > _BLOCKED_VOXELS)
     trusted = flat & sure & (distance < 1) & ~blocked
-    return jnp.where(trusted, jnp.where(by_plane, 1.0, -1.0), by_rays)
+    sign = jnp.where(trusted, jnp.where(in_front | sheet, 1.0, -1.0), by_rays)
+    along = jnp.sqrt(jnp.maximum(distance**2 - height**2, 0))
+    # In a free voxel in front of a patch the rays say nothing about the space behind it.
+    in_front_of_solid = (sign > 0) & in_front & ~sheet & (distance < 1)
+    beside = (trusted | in_front_of_solid) & (along < _BESIDE_VOXELS)
+    by_plane = jnp.where(sheet, Side.SHEET, Side.PLANE)
+    return sign, jnp.where(beside, by_plane, sign).astype(jnp.int8)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
-from hiosdf_jax._src.state import FRONTIER_STEPS, NO_FEATURE, Derived, Evidence, Grid
+from hiosdf_jax._src.state import FRONTIER_STEPS, NO_FEATURE, Derived, Evidence, Grid, Side
 
 # Half the memory of float32, and finer than the noise.
 _STORED = jnp.float16
@@ -59,6 +59,7 @@ def empty_grid(config: Config) -> Grid:
         derived=Derived(
             nearest=jnp.full((*shape, 3), NO_FEATURE, jnp.int8),
             sdf=jnp.full(shape, config.distance_horizon, _STORED),
+            side=jnp.full(shape, Side.UNKNOWN, jnp.int8),
             doubt=jnp.full(shape, config.distance_horizon, _STORED),
             frontier_steps=jnp.full(shape, -FRONTIER_STEPS, jnp.int8),
         ),

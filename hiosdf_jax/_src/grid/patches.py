@@ -114,6 +114,8 @@ def fuse_hits(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWin
 def _face_sensor(deviation: jax.Array, direction: jax.Array, to_sensor: jax.Array) -> jax.Array:
     """Turns the last principal axis, the normal, to the sensor's side.
 
+    The axes become right-handed, so that the first two give the normal.
+
     Hits on a line do not determine the normal. There it is the part of the direction to the sensor
     that is perpendicular to the line, since the surface was seen from there.
 
@@ -133,8 +135,7 @@ def _face_sensor(deviation: jax.Array, direction: jax.Array, to_sensor: jax.Arra
     far = length(split(across))[:, None]
     line = ~directed[:, 1:2] & (far > 1e-3)
     normal = jnp.where(line, across / jnp.maximum(far, 1e-3), normal)
-    middle = jnp.where(line, jnp.cross(normal, first), direction[:, 1])
-    return jnp.stack([first, middle, normal], axis=1)
+    return jnp.stack([first, jnp.cross(normal, first), normal], axis=1)
 
 
 def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Array) -> jax.Array:

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.mapping.pipeline import init
-from hiosdf_jax._src.state import MapState, check_map
+from hiosdf_jax._src.state import Grid, MapState, check_map
 
 _FORMAT = "hiosdf_jax map"
-_VERSION = 3
+_VERSION = 4
 
 # Names in the file are part of its format; attributes of the code may be renamed.
 _FILE_NAMES = {
@@ -34,13 +35,12 @@ _FILE_NAMES = {
     "network.average.": "network.served.",
 }
 
-# Arrays that files of version 2 do not have; they are zero there.
-_SINCE_VERSION_3 = (
-    "grid.change",
-    "report.points_moving",
-    "report.refused_in_row",
-    "report.update_flags",
-)
+# Arrays that files of older versions do not have, by the version that has them first. They are zero
+# there; those that follow from others are computed anew.
+_SINCE = {
+    3: ("grid.change", "report.points_moving", "report.refused_in_row", "report.update_flags"),
+    4: ("grid.surface.side",),
+}
 
 # Raised by numpy and zipfile for damaged files and for files that are no archives.
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, KeyError)
@@ -119,17 +119,18 @@ def load(path: str | os.PathLike[str]) -> MapState:
         version, fields, key_impl = header["version"], header["config"], header["key"]
     except (KeyError, TypeError, json.JSONDecodeError):
         raise ValueError(f"{path} is not a hiosdf_jax map: it has no such header") from None
-    if version not in (2, _VERSION):
-        raise ValueError(f"{path} has format version {version}, expected 2 or {_VERSION}")
+    if version not in range(2, _VERSION + 1):
+        raise ValueError(f"{path} has format version {version}, expected 2 to {_VERSION}")
     try:
         config = Config(**fields)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} has no valid configuration: {error}") from error
     template = jax.eval_shape(lambda: _without_key(init(config, jax.random.key(0, impl=key_impl))))
     expected = _named_leaves(template)
-    if version == 2:
-        new = {name: expected[name] for name in _SINCE_VERSION_3}
-        arrays = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in new.items()} | arrays
+    for since, names in _SINCE.items():
+        if version < since:
+            new = {name: np.zeros(expected[name].shape, expected[name].dtype) for name in names}
+            arrays = new | arrays
     for name, leaf in expected.items():
         if name not in arrays:
             raise ValueError(f"{path} lacks the array {name}")
@@ -140,7 +141,18 @@ def load(path: str | os.PathLike[str]) -> MapState:
             )
     leaves = [jnp.asarray(arrays[name]) for name in expected]
     state = jax.tree.unflatten(jax.tree.structure(template), leaves)
+    if version < 4:
+        state = state.replace(grid=_with_sides(config, state.grid))
     return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))
+
+
+def _with_sides(config: Config, grid: Grid) -> Grid:
+    """Turns the axes of the grid of an older file to be right-handed, and computes its sides."""
+    axes = grid.evidence.axes
+    turned = jnp.linalg.det(axes.astype(jnp.float32)) < 0
+    middle = jnp.where(turned[..., None], -axes[..., 1, :], axes[..., 1, :])
+    evidence = grid.evidence.replace(axes=axes.at[..., 1, :].set(middle))
+    return jax.jit(recompute_distances, static_argnums=0)(config, grid.replace(evidence=evidence))
 
 
 def _without_key(state: MapState) -> MapState:
