@@ -245,6 +245,22 @@ def test_init_and_queries_name_wrong_arguments(room_map):
     assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))
 
 
+@pytest.mark.parametrize(
+    "flags, names",
+    [
+        (0, "none"),
+        (2, "EMPTY_CLOUD"),
+        (48, "OUT_OF_RANGE|INCONSISTENT_CLOUD"),
+        (1 + 2**20, "BAD_POSE|1048576"),  # a flag of a later version
+    ],
+)
+def test_flags_print_their_names(flags, names):
+    flags = hio.Flag(flags)
+    assert str(flags) == f"{flags}" == names
+    assert f"{flags:>40}" == names.rjust(40)
+    assert (hio.Flag.OUT_OF_RANGE in flags) == ("OUT_OF_RANGE" in names)
+
+
 OUT_OF_RANGE = {"far": np.full((50, 3), 30.0), "near": np.zeros((4, 3))}
 
 

@@ -28,7 +28,15 @@ def frontier_step_m(config: Config) -> float:
 
 
 class Flag(enum.IntFlag):
-    """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`."""
+    """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`.
+
+    Example:
+        >>> flags = hio.Flag(int(state.report.update_flags))
+        >>> hio.Flag.BAD_POSE in flags
+        False
+        >>> print(flags)
+        OUT_OF_RANGE|INCONSISTENT_CLOUD
+    """
 
     BAD_POSE = 1
     """A pose was not finite, not rigid, or 100 km away. That update changed nothing else."""
@@ -47,6 +55,16 @@ class Flag(enum.IntFlag):
     BAD_ARGUMENT = 64
     """Inside jit, `robot` or `noise` was not finite or out of range. That update changed nothing
     else."""
+
+    def __str__(self) -> str:
+        """Returns the names of the flags with `|` between them, or "none"."""
+        names = [str(flag.name) for flag in type(self) if flag & self]
+        unknown = int(self) & ~sum(type(self))
+        return "|".join([*names, str(unknown)] if unknown else names) or "none"
+
+    def __format__(self, spec: str) -> str:
+        """Formats the names, as `str` does."""
+        return format(str(self), spec)
 
 
 class Report(flax.struct.PyTreeNode):
