@@ -145,7 +145,8 @@ def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty_ma
     # A sensor that is far outside of the box with all its points must not harm the map either.
     pose = np.eye(4)
     pose[0, 3] = 50
-    far = hio.update(state, cloud, pose)
+    with pytest.warns(UserWarning, match="less than 1 % of its returns in range inside the bounds"):
+        far = hio.update(state, cloud, pose)
     assert arrays_equal(far.grid.evidence.hits, state.grid.evidence.hits)
     assert np.isfinite(np.asarray(hio.sdf(far, np.zeros((1, 3))))).all()
 

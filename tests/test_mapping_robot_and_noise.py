@@ -74,6 +74,13 @@ def test_surfaces_just_beyond_the_margin_stay(empty_map):
     )
 
 
+def test_no_spheres_are_no_robot(empty_map):
+    cloud, pose = room_cloud(0)
+    nothing = (np.zeros((0, 3)), np.zeros(0))
+    expected = hio.update(empty_map, cloud, pose)
+    assert arrays_equal(hio.update(empty_map, cloud, pose, robot=nothing), expected)
+
+
 def test_the_robot_is_traced(empty_map):
     _, covered, _, pose = cloud_with_an_arm()
     hio.update(empty_map, covered, pose, robot=(CENTERS, RADII))
@@ -122,6 +129,7 @@ def test_the_configurations_noise_is_the_default(empty_map):
         ({"robot": (CENTERS[:, :2], RADII)}, r"robot has centers of shape \(2, 2\)"),
         ({"robot": (CENTERS * np.nan, RADII)}, "robot centers has values"),
         ({"robot": (CENTERS, -RADII)}, "robot radii has values"),
+        ({"robot": (CENTERS, 1000 * RADII)}, "from 50.0 to 60.0, expected meters, .* millimeters"),
         ({"noise": 0.01}, "noise is 0.01, expected two numbers"),
         ({"noise": (0.0, 0.1)}, "noise a has values"),
         ({"noise": (1e-22, 0.0)}, "noise a has values"),
@@ -139,7 +147,7 @@ def test_bad_extras_are_refused(empty_map, extras, message):
 def test_a_pose_too_far_away_is_refused(empty_map):
     cloud, pose = room_cloud(0)
     pose[0, 3] = 1e20
-    with pytest.raises(ValueError, match="at most 100 km"):
+    with pytest.raises(ValueError, match=r"pose is 1e\+17 km from the origin, .* at most 100 km"):
         hio.update(empty_map, cloud, pose)
     padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
     padded[: len(cloud)] = cloud
@@ -153,6 +161,8 @@ BAD_INSIDE_JIT = {
     "NaN center": {"robot": (CENTERS * np.nan, RADII)},
     "negative radius": {"robot": (CENTERS, -RADII)},
     "infinite radius": {"robot": (CENTERS, RADII * np.inf)},
+    "NaN radius": {"robot": (CENTERS, RADII * np.nan)},
+    "radius in millimeters": {"robot": (CENTERS, 1000 * RADII)},
     "no noise": {"noise": np.zeros(2, np.float32)},
     "NaN noise": {"noise": np.full(2, np.nan, np.float32)},
     "tiny noise": {"noise": np.array([1e-22, 0], np.float32)},

@@ -27,6 +27,7 @@ from hiosdf_jax._src.numerics.posed_cloud import (
     check_shapes,
     prepare,
     warn_out_of_range,
+    warn_outside,
 )
 from hiosdf_jax._src.state import Field, MapState, Report, check_map, field_of
 
@@ -130,7 +131,9 @@ def update(
     compiled = _update_donating if donate else _update_jit
     config = state.config
     cloud, pose = prepare(cloud, pose, config.max_points)
-    warn_out_of_range(cloud, config.min_range, config.max_range, config.min_in_range)
+    limits = (config.min_range, config.max_range, config.min_in_range)
+    if not warn_out_of_range(cloud, *limits):
+        warn_outside(cloud, pose, config.bounds, *limits)
     return compiled(state, cloud, pose, *extras)
 
 
