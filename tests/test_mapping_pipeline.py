@@ -159,6 +159,21 @@ def test_range_limits_are_counted(empty_map):
     assert float(jnp.sum(state.grid.evidence.hits)) == 1
 
 
+def test_an_optimizer_that_is_not_finite_is_flagged_and_heals(room_map):
+    adam, *rest = room_map.network.optimizer
+    spoiled = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.inf), adam.nu)
+    network = room_map.network.replace(optimizer=(adam._replace(nu=spoiled), *rest))
+    cloud, pose = stream(1)[0]
+    flagged = hio.update(room_map.replace(network=network), cloud, pose)
+    assert int(flagged.report.update_flags) == hio.Flag.TRAINING_FAILED
+    assert int(flagged.updates) == int(room_map.updates) + 1
+    assert arrays_equal(flagged.network.params, room_map.network.params)
+    assert arrays_equal(flagged.network.average, room_map.network.average)
+    healed = hio.update(flagged, cloud, pose)
+    assert int(healed.report.update_flags) == 0
+    assert not arrays_equal(healed.network.params, room_map.network.params)
+
+
 MOVE = np.array([3.0, -2.0, 1.0], np.float32)  # multiples of 0.1 m; exact in binary
 
 
