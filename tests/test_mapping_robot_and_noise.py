@@ -7,6 +7,7 @@ import pytest
 from room import CONFIG, arrays_equal, room_cloud
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.grid import rays
 from hiosdf_jax._src.mapping import pipeline
 
 CENTERS = np.array([[0.3, 0.05, 0.0], [0.42, 0.05, 0.05]], np.float32)  # m, world
@@ -38,6 +39,7 @@ def test_returns_on_the_robot_change_nothing(empty_map):
     for part in ("grid", "network", "optimism"):
         assert arrays_equal(getattr(actual, part), getattr(expected, part)), part
     assert int(actual.report.points_used) == int(expected.report.points_used)
+    assert int(actual.report.points_out_of_range) == 0  # the arm's returns are in range
     ghost = hio.update(empty_map, covered, pose)
     assert float(hio.sdf(ghost, CENTERS[0])) < 0.1 < float(hio.sdf(actual, CENTERS[0]))
 
@@ -72,6 +74,20 @@ def test_surfaces_just_beyond_the_margin_stay(empty_map):
     assert arrays_equal(
         hio.update(empty_map, cloud, pose, robot=(beside, radii)).grid, expected.grid
     )
+
+
+def test_the_margin_is_three_standard_deviations_of_a_noisy_return():
+    cloud = np.array([[1.0, 0, 0], [2.0, 0, 0]], np.float32)
+    finite, pose = np.ones(2, bool), np.eye(4, dtype=np.float32)
+    radii = np.full(2, 0.1, np.float32)
+    for noise, margins in (((0.005, 0.0), (0.03, 0.03)), ((0.01, 0.02), (0.09, 0.27))):
+        placed = rays.place_cloud(CONFIG, cloud, finite, pose, jnp.asarray(noise))
+        for gap, found in ((-0.002, True), (0.002, False)):
+            reach = radii + np.asarray(margins, np.float32) + np.float32(gap)
+            centers = cloud + reach[:, None] * np.array([[0, 1, 0]], np.float32)
+            left = rays.remove_robot(placed, jnp.asarray(centers), jnp.asarray(radii))
+            assert (np.asarray(left.ends) == (not found)).all()
+            assert (np.asarray(left.in_range) == (not found)).all()
 
 
 def test_no_spheres_are_no_robot(empty_map):

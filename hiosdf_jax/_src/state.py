@@ -45,7 +45,8 @@ class Flag(enum.IntFlag):
     POINTS_OUTSIDE = 4
     """Returns in range fell outside the bounds. Their rays cleared space but left no surface."""
     TRAINING_FAILED = 8
-    """A training step was not finite. The network was kept as it was."""
+    """Training was not finite. The network was kept as it was, and the next update trains it again;
+    the optimizer starts anew if it was the cause."""
     OUT_OF_RANGE = 16
     """Almost no return was in range; see `Config.min_in_range`. That update changed nothing else:
     check the unit, which must be m."""
@@ -74,10 +75,12 @@ class Report(flax.struct.PyTreeNode):
     `refused_in_row`.
 
     Attributes:
-        points_used: Points that were fused into the grid, int32.
-        points_outside: Returns in range that lie outside the bounds, int32.
-        points_out_of_range: Finite points nearer than min_range or farther than max_range, int32.
-        points_invalid: Rows with a NaN or inf, padding included, int32.
+        points_used: Returns that were fused into the grid, int32.
+        points_outside: Returns in range that lie outside the bounds, int32. Stray returns and
+            those on the robot count neither here nor in `points_used`.
+        points_out_of_range: Returns nearer than min_range or farther than max_range, int32.
+        points_invalid: Rows with a NaN or inf, int32. Outside jit the rows count that `update` has
+            added to reach `Config.max_points`, too.
         sdf_loss: Mean |f - s| over the samples in the last epoch, m, float32 (paper, eq. 4).
         eikonal_loss: Mean | |grad f| - 1 | in the last epoch, float32 (paper, eq. 5).
         points_moving: Returns in space that had been free: on things that move or are new, int32.
