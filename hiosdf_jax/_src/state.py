@@ -270,7 +270,8 @@ class Query(NamedTuple):
         observed: Whether a ray has reached the voxel that contains the point, (...) bool.
         frontier: Distance to the nearest voxel that no ray has reached, (...) float32, m; not
             positive in such voxels.
-        lower: Lower bound of the true distance, calibrated on each new cloud, (...) float32, m.
+        lower: At most the true distance at about 99 % of the points of free space, (...) float32,
+            m. It is calibrated on each new cloud, not guaranteed, and counts unseen space as solid.
     """
 
     sdf: jax.Array
