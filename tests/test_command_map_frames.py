@@ -4,10 +4,11 @@ import json
 
 import jax
 import numpy as np
-from room import CONFIG
+import pytest
+from room import CONFIG, room_cloud
 from room_files import BOX, RAYS, use_room_config, write_points
 
-from hiosdf_jax._src.command import cli, map_stream
+from hiosdf_jax._src.command import cli, map_stream, report
 from hiosdf_jax._src.command.map_frames import fuse_frames
 from hiosdf_jax.datasets import NpzStream
 
@@ -57,3 +58,14 @@ def test_no_usable_frame(tmp_path, capsys, monkeypatch):
     assert cli.main(arguments) == 1  # bounds cannot be found either
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "hiosdf: none of the 2 frames can be used, expected at least one"
+
+
+def test_a_refused_frame_adds_no_points():
+    near, pose = room_cloud(0)
+    with pytest.warns(UserWarning, match="cloud has 0 of 250 returns between"):
+        mapped = fuse_frames(
+            [(near, pose), (near + 30, pose), (near, pose)], CONFIG, jax.random.key(0)
+        )
+    assert int(mapped.state.updates) == 2
+    assert (mapped.points_used, mapped.points_outside) == (500, 0)
+    assert "flag OUT_OF_RANGE" in report.summarize(report.describe(mapped, CONFIG))

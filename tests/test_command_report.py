@@ -1,5 +1,6 @@
 """The report of a run: counts and times, the summary, and JSON."""
 
+import dataclasses
 import json
 import math
 
@@ -59,3 +60,11 @@ def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):
     report.write_json(tmp_path / "metrics.json", value)
     text = (tmp_path / "metrics.json").read_text("utf-8")
     assert json.loads(text) == {"a": [1, None], "b": {"c": [None, 2.5, "x", None]}}
+
+
+@pytest.mark.parametrize("flag", hio.Flag, ids=str)
+def test_the_summary_has_words_for_every_flag(mapped, flag):
+    flags = np.uint32(flag)
+    state = mapped.state.replace(report=mapped.state.report.replace(flags=flags))
+    metrics = report.describe(dataclasses.replace(mapped, state=state), CONFIG)
+    assert f"flag {flag}: " in report.summarize(metrics)

@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from room import stream
+from room import arrays_equal, stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping import background
 
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)).astype(np.float32)
+
+
+class Unreadable:
+    def __array__(self, *_, **__):
+        raise RuntimeError("on another device")
 
 
 def test_the_map_is_that_of_a_plain_loop(empty_map):
@@ -34,7 +39,7 @@ def test_the_newest_frame_replaces_the_waiting_one(empty_map, monkeypatch):
     begun, go = threading.Event(), threading.Event()
     fused = []
 
-    def slow(state, cloud, pose):
+    def slow(state, cloud, pose, **_):
         fused.append(float(cloud[0, 0]))
         begun.set()
         assert go.wait(10)
@@ -70,8 +75,56 @@ def test_a_bad_frame_is_counted_and_mapping_continues(empty_map):
     assert int(mapper.field.updates) == 1
 
 
+def test_a_refused_frame_leaves_the_field_and_its_stamp(empty_map):
+    cloud, pose = stream(1)[0]
+    with hio.BackgroundMapper(empty_map) as mapper:
+        mapper.put(cloud, pose, stamp=1.0)
+        mapper.wait()
+        field = mapper.field
+        with pytest.warns(UserWarning, match="cloud has 0 of 250 returns between"):
+            mapper.put(cloud + 30, pose, stamp=2.0)
+            state = mapper.wait()
+        assert mapper.field is field and float(field.stamp) == 1.0
+        assert mapper.rejected == 1
+        assert "raised the flags OUT_OF_RANGE" in str(mapper.rejection)
+        assert hio.Flag.OUT_OF_RANGE in hio.Flag(int(state.report.update_flags))
+        mapper.put(cloud, pose, stamp=3.0)
+        mapper.wait()
+        assert float(mapper.field.stamp) == 3.0 and int(mapper.field.updates) == 2
+    assert mapper.rejected == 1
+
+
+def test_the_robot_and_the_noise_are_passed_on(empty_map):
+    cloud, pose = stream(1)[0]
+    # As many spheres as in test_mapping_robot_and_noise.py: one compilation.
+    robot = (cloud[:2] @ pose[:3, :3].T + pose[:3, 3], np.full(2, 0.1))
+    for extras in ({"robot": robot}, {"noise": (0.004, 0.001)}):
+        with hio.BackgroundMapper(empty_map) as mapper:
+            mapper.put(cloud, pose, **extras)
+        assert arrays_equal(mapper.wait(), hio.update(empty_map, cloud, pose, **extras))
+    assert int(hio.update(empty_map, cloud, pose, robot=robot).report.points_used) < len(cloud)
+
+
+@pytest.mark.parametrize(
+    "extras, message",
+    [
+        ({"robot": 3}, "robot is 3"),
+        ({"robot": (Unreadable(), [0.1])}, "on another device"),
+        ({"noise": (0.0, 0.0)}, "noise a has values"),
+    ],
+)
+def test_bad_extras_are_counted_and_mapping_continues(empty_map, extras, message):
+    cloud, pose = stream(1)[0]
+    with hio.BackgroundMapper(empty_map) as mapper:
+        mapper.put(cloud, pose, **extras)
+        mapper.wait()
+        mapper.put(cloud, pose)
+    assert mapper.rejected == 1 and message in str(mapper.rejection)
+    assert int(mapper.field.updates) == 1
+
+
 def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch):
-    def broken(*_):
+    def broken(*_, **__):
         raise OSError("no device")
 
     monkeypatch.setattr(background, "update", broken)
@@ -83,11 +136,6 @@ def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch)
         mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
         mapper.close()
-
-
-class Unreadable:
-    def __array__(self, *_, **__):
-        raise RuntimeError("on another device")
 
 
 BAD_CLOUDS = {
@@ -140,7 +188,7 @@ from hiosdf_jax._src.mapping import background
 def work(x):
     return jax.lax.fori_loop(0, 300, lambda _, x: jnp.tanh(x @ x), x)
 
-def update(state, cloud, pose):
+def update(state, cloud, pose, **_):
     for _ in range(10):
         jax.block_until_ready(work(jnp.ones((200, 200))))
     return state

@@ -90,6 +90,12 @@ def test_a_bad_box_is_named(room_map, box):
         hio.forget(room_map, box)
 
 
+def test_a_traced_box_is_named(room_map):
+    for forget in (hio.forget, lambda state, box: hio.forget(state, (box[0], box[1]))):
+        with pytest.raises(ValueError, match="box is traced, expected concrete numbers"):
+            jax.jit(forget)(room_map, np.asarray(BOX))
+
+
 def test_what_is_no_map_is_named():
     with pytest.raises(ValueError, match="state is tuple"):
         hio.forget(BOUNDS, BOX)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import CONFIG, room_cloud
+from room import CONFIG, HALF, room_cloud
 
 import hiosdf_jax as hio
 
@@ -28,6 +28,35 @@ def test_returns_in_free_space_are_found_and_those_on_walls_are_not(sharp_map):
     assert not moving[60:].any()
     after = hio.update(sharp_map, cloud, pose)
     assert int(after.report.points_moving) == moving.sum()
+
+
+def test_returns_on_the_robot_are_not_moving(sharp_map):
+    cloud, pose = cloud_with_a_thing()
+    centers = cloud[:60] @ pose[:3, :3].T + pose[:3, 3]
+    robot = (centers, np.full(60, 0.01, np.float32))
+    plain = np.asarray(hio.moving_rows(sharp_map, cloud, pose))
+    assert plain[:60].sum() > 30
+    assert not np.asarray(hio.moving_rows(sharp_map, cloud, pose, robot=robot)).any()
+    find = jax.jit(
+        lambda centers: hio.moving_rows(sharp_map, cloud, pose, robot=(centers, robot[1]))
+    )
+    assert not np.asarray(find(jnp.asarray(centers))).any()
+    np.testing.assert_array_equal(find(jnp.asarray(centers) + 9), plain)
+
+
+def test_stray_returns_are_not_moving(sharp_map):
+    """A narrow cone of returns on a wall, and ten in free space: alone, or at one range."""
+    ahead = np.random.default_rng(0).uniform(-0.02, 0.02, (250, 3)).astype(np.float32)
+    ahead[:, 0] = 1
+    cloud, share = np.float32(HALF[0]) * ahead, np.ones((250, 1), np.float32)
+    for together in (False, True):
+        share[:10, 0] = 0.45 if together else np.geomspace(0.25, 0.6, 10)
+        thing = share * cloud
+        moving = np.asarray(hio.moving_rows(sharp_map, thing, np.eye(4)))
+        assert not moving[10:].any()
+        assert moving[:10].sum() == 10 * together
+        after = hio.update(sharp_map, thing, np.eye(4))
+        assert int(after.report.points_moving) == moving.sum()
 
 
 def test_an_empty_map_calls_nothing_moving(empty_map):
@@ -70,3 +99,5 @@ def test_bad_arguments_are_named(sharp_map):
         hio.moving_rows(sharp_map, cloud, np.diag([2.0, 2, 2, 1]))
     with pytest.raises(ValueError, match="noise"):
         hio.moving_rows(sharp_map, cloud, pose, noise=3)
+    with pytest.raises(ValueError, match="robot radii has values"):
+        hio.moving_rows(sharp_map, cloud, pose, robot=(cloud[:2], [-1, 1]))

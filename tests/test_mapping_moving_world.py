@@ -223,8 +223,10 @@ def test_clouds_in_meters_do_not_warn(empty_map):
         after = hio.update(empty_map, few, pose)
     assert int(after.report.points_used) == 10
     assert not int(after.report.flags) & hio.Flag.OUT_OF_RANGE
-    with pytest.warns(UserWarning, match="Its unit must be m"):
+    with pytest.warns(UserWarning, match="It looks like centimeters, expected m"):
         hio.update(empty_map, 100 * cloud, pose)
+    with pytest.warns(UserWarning, match="Its unit must be m"):
+        hio.update(empty_map, 1e5 * cloud, pose)
 
 
 @pytest.mark.parametrize("missing", [np.nan, np.inf, -np.inf])

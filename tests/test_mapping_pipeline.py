@@ -145,7 +145,8 @@ def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty_ma
     # A sensor that is far outside of the box with all its points must not harm the map either.
     pose = np.eye(4)
     pose[0, 3] = 50
-    far = hio.update(state, cloud, pose)
+    with pytest.warns(UserWarning, match="less than 1 % of its returns in range inside the bounds"):
+        far = hio.update(state, cloud, pose)
     assert arrays_equal(far.grid.evidence.hits, state.grid.evidence.hits)
     assert np.isfinite(np.asarray(hio.sdf(far, np.zeros((1, 3))))).all()
 
@@ -156,6 +157,21 @@ def test_range_limits_are_counted(empty_map):
     assert int(state.report.points_out_of_range) == 2
     assert int(state.report.points_used) == 1
     assert float(jnp.sum(state.grid.evidence.hits)) == 1
+
+
+def test_an_optimizer_that_is_not_finite_is_flagged_and_heals(room_map):
+    adam, *rest = room_map.network.optimizer
+    spoiled = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.inf), adam.nu)
+    network = room_map.network.replace(optimizer=(adam._replace(nu=spoiled), *rest))
+    cloud, pose = stream(1)[0]
+    flagged = hio.update(room_map.replace(network=network), cloud, pose)
+    assert int(flagged.report.update_flags) == hio.Flag.TRAINING_FAILED
+    assert int(flagged.updates) == int(room_map.updates) + 1
+    assert arrays_equal(flagged.network.params, room_map.network.params)
+    assert arrays_equal(flagged.network.average, room_map.network.average)
+    healed = hio.update(flagged, cloud, pose)
+    assert int(healed.report.update_flags) == 0
+    assert not arrays_equal(healed.network.params, room_map.network.params)
 
 
 MOVE = np.array([3.0, -2.0, 1.0], np.float32)  # multiples of 0.1 m; exact in binary
@@ -243,6 +259,22 @@ def test_init_and_queries_name_wrong_arguments(room_map):
         hio.save("nowhere", 3)
     old_style = hio.init(CONFIG, jax.random.PRNGKey(0))
     assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))
+
+
+@pytest.mark.parametrize(
+    "flags, names",
+    [
+        (0, "none"),
+        (2, "EMPTY_CLOUD"),
+        (48, "OUT_OF_RANGE|INCONSISTENT_CLOUD"),
+        (1 + 2**20, "BAD_POSE|1048576"),  # a flag of a later version
+    ],
+)
+def test_flags_print_their_names(flags, names):
+    flags = hio.Flag(flags)
+    assert str(flags) == f"{flags}" == names
+    assert f"{flags:>40}" == names.rjust(40)
+    assert (hio.Flag.OUT_OF_RANGE in flags) == ("OUT_OF_RANGE" in names)
 
 
 OUT_OF_RANGE = {"far": np.full((50, 3), 30.0), "near": np.zeros((4, 3))}

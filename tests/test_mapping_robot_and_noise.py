@@ -7,6 +7,7 @@ import pytest
 from room import CONFIG, arrays_equal, room_cloud
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.grid import rays
 from hiosdf_jax._src.mapping import pipeline
 
 CENTERS = np.array([[0.3, 0.05, 0.0], [0.42, 0.05, 0.05]], np.float32)  # m, world
@@ -38,6 +39,7 @@ def test_returns_on_the_robot_change_nothing(empty_map):
     for part in ("grid", "network", "optimism"):
         assert arrays_equal(getattr(actual, part), getattr(expected, part)), part
     assert int(actual.report.points_used) == int(expected.report.points_used)
+    assert int(actual.report.points_out_of_range) == 0  # the arm's returns are in range
     ghost = hio.update(empty_map, covered, pose)
     assert float(hio.sdf(ghost, CENTERS[0])) < 0.1 < float(hio.sdf(actual, CENTERS[0]))
 
@@ -72,6 +74,27 @@ def test_surfaces_just_beyond_the_margin_stay(empty_map):
     assert arrays_equal(
         hio.update(empty_map, cloud, pose, robot=(beside, radii)).grid, expected.grid
     )
+
+
+def test_the_margin_is_three_standard_deviations_of_a_noisy_return():
+    cloud = np.array([[1.0, 0, 0], [2.0, 0, 0]], np.float32)
+    finite, pose = np.ones(2, bool), np.eye(4, dtype=np.float32)
+    radii = np.full(2, 0.1, np.float32)
+    for noise, margins in (((0.005, 0.0), (0.03, 0.03)), ((0.01, 0.02), (0.09, 0.27))):
+        placed = rays.place_cloud(CONFIG, cloud, finite, pose, jnp.asarray(noise))
+        for gap, found in ((-0.002, True), (0.002, False)):
+            reach = radii + np.asarray(margins, np.float32) + np.float32(gap)
+            centers = cloud + reach[:, None] * np.array([[0, 1, 0]], np.float32)
+            left = rays.remove_robot(placed, jnp.asarray(centers), jnp.asarray(radii))
+            assert (np.asarray(left.ends) == (not found)).all()
+            assert (np.asarray(left.in_range) == (not found)).all()
+
+
+def test_no_spheres_are_no_robot(empty_map):
+    cloud, pose = room_cloud(0)
+    nothing = (np.zeros((0, 3)), np.zeros(0))
+    expected = hio.update(empty_map, cloud, pose)
+    assert arrays_equal(hio.update(empty_map, cloud, pose, robot=nothing), expected)
 
 
 def test_the_robot_is_traced(empty_map):
@@ -122,6 +145,7 @@ def test_the_configurations_noise_is_the_default(empty_map):
         ({"robot": (CENTERS[:, :2], RADII)}, r"robot has centers of shape \(2, 2\)"),
         ({"robot": (CENTERS * np.nan, RADII)}, "robot centers has values"),
         ({"robot": (CENTERS, -RADII)}, "robot radii has values"),
+        ({"robot": (CENTERS, 1000 * RADII)}, "from 50.0 to 60.0, expected meters, .* millimeters"),
         ({"noise": 0.01}, "noise is 0.01, expected two numbers"),
         ({"noise": (0.0, 0.1)}, "noise a has values"),
         ({"noise": (1e-22, 0.0)}, "noise a has values"),
@@ -139,7 +163,7 @@ def test_bad_extras_are_refused(empty_map, extras, message):
 def test_a_pose_too_far_away_is_refused(empty_map):
     cloud, pose = room_cloud(0)
     pose[0, 3] = 1e20
-    with pytest.raises(ValueError, match="at most 100 km"):
+    with pytest.raises(ValueError, match=r"pose is 1e\+17 km from the origin, .* at most 100 km"):
         hio.update(empty_map, cloud, pose)
     padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
     padded[: len(cloud)] = cloud
@@ -153,6 +177,8 @@ BAD_INSIDE_JIT = {
     "NaN center": {"robot": (CENTERS * np.nan, RADII)},
     "negative radius": {"robot": (CENTERS, -RADII)},
     "infinite radius": {"robot": (CENTERS, RADII * np.inf)},
+    "NaN radius": {"robot": (CENTERS, RADII * np.nan)},
+    "radius in millimeters": {"robot": (CENTERS, 1000 * RADII)},
     "no noise": {"noise": np.zeros(2, np.float32)},
     "NaN noise": {"noise": np.full(2, np.nan, np.float32)},
     "tiny noise": {"noise": np.array([1e-22, 0], np.float32)},

@@ -233,6 +233,24 @@ def test_a_sample_that_is_not_finite_leaves_the_network_as_it_was():
         np.testing.assert_array_equal(a, b)
 
 
+def test_an_optimizer_that_is_not_finite_starts_anew():
+    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples()
+    network, *_ = train(TINY, network, samples, 3)
+    adam, *rest = network.optimizer
+    spoiled = jax.tree.map(lambda leaf: leaf.at[..., 0].set(jnp.inf), adam.nu)
+    broken = network.replace(optimizer=(adam._replace(nu=spoiled), *rest))
+    after, _, finite = train(TINY, broken, samples, 3)
+    assert not bool(finite)
+    fresh = training.init_network(TINY, jax.random.key(1)).optimizer
+    for a, b in zip(
+        jax.tree.leaves(after), jax.tree.leaves(network.replace(optimizer=fresh)), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    healed, _, finite = train(TINY, after, samples, 3)
+    assert bool(finite)
+    assert not np.array_equal(*(jax.tree.leaves(each.params)[0] for each in (healed, network)))
+
+
 def test_the_schedule_warms_up_and_queries_never_use_the_untrained_network():
     config = dataclasses.replace(TINY, warmup_updates=3, warmup_epochs=7, epochs=2)
     config = dataclasses.replace(config, weight_average=0.8)

@@ -1,12 +1,20 @@
 """Checks of clouds and poses, and their messages."""
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from poses import random_pose
 
-from hiosdf_jax._src.numerics.posed_cloud import check_pose, check_shapes, finite_rows
+from hiosdf_jax._src.numerics.posed_cloud import (
+    check_pose,
+    check_shapes,
+    finite_rows,
+    warn_out_of_range,
+    warn_outside,
+)
 
 SEEDS = st.integers(0, 2**31)
 
@@ -23,27 +31,40 @@ def test_rigid_poses_pass(seed, noise):
     np.testing.assert_allclose(checked, pose, rtol=1e-6)
 
 
+def sheared():
+    return np.eye(4) + 0.05 * np.eye(4, k=1) * [1, 1, 0, 0]
+
+
+def moved(pose, offset):
+    return pose + np.pad(np.reshape(offset, (3, 1)), ((0, 1), (3, 0)))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda pose: pose * np.nan, "not finite"),
         (lambda pose: np.full((4, 4), -np.inf), "not finite"),
-        (lambda pose: pose * [1.01, 1.01, 1.01, 1], "not rigid"),
-        (lambda pose: pose * [-1, 1, 1, 1], "not rigid"),  # a mirror
-        (lambda pose: np.zeros((4, 4)), "not rigid"),
-        (lambda pose: pose.T, "not rigid"),
+        (lambda pose: pose * [1.01, 1.01, 1.01, 1], "not rigid: its columns have length 1.01, "),
+        (lambda pose: pose * [1, 1.1, 1, 1], r"not rigid: .* length \[1. , 1.1, 1. \], expected 1"),
+        (lambda pose: pose * [-1, 1, 1, 1], "not rigid: its determinant is -1, expected 1"),
+        (lambda pose: pose @ sheared(), "not rigid: its columns are not perpendicular"),
+        (lambda pose: np.zeros((4, 4)), r"not rigid: its last row is \[0., 0., 0., 0.\], expected"),
+        (lambda pose: np.diag([0.0, 0, 0, 1]), "not rigid: its columns have length 0, expected 1"),
+        (lambda pose: pose.T, r"not rigid: its last row is .*\[0, 0, 0, 1\]; is it transposed\?"),
+        (lambda pose: moved(pose, [1e5, 1e5, 1e5]), "173.2 km from the origin, .* at most 100 km"),
         (lambda pose: pose[:3], r"shape \(3, 4\), expected \(4, 4\)"),
         (lambda pose: pose + 1e300 * np.eye(4, k=3), "not finite"),  # not in float32
     ],
 )
 def test_other_poses_are_refused(change, message):
     pose = random_pose(np.random.default_rng(0))
-    with pytest.raises(ValueError, match=f"here, line 3: pose .*{message}"):
+    with pytest.raises(ValueError, match=f"here, line 3: pose .*{message}") as error:
         check_pose(change(pose), "here, line 3")
+    assert ("transposed" in str(error.value)) == ("transposed" in message)
 
 
 def test_the_source_of_a_pose_is_optional():
-    with pytest.raises(ValueError, match=r"^pose is not rigid, expected a rotation and a trans"):
+    with pytest.raises(ValueError, match=r"^pose is not rigid: its last row is"):
         check_pose(np.zeros((4, 4)))
 
 
@@ -73,3 +94,50 @@ def test_shapes_are_checked_without_values():
         check_shapes(np.zeros((2, 4)), np.eye(4))
     with pytest.raises(ValueError, match=r"pose has shape \(3, 3\), expected \(4, 4\)"):
         check_shapes(np.zeros((2, 3)), np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("scale", "max_range", "hint"),
+    [
+        (1000, 5.0, "looks like millimeters, expected m"),
+        (100, 5.0, "looks like centimeters, expected m"),
+        (300, 20.0, "looks like centimeters or millimeters, expected m"),
+        (1e6, 5.0, "Its unit must be m; Config.min_in_range is 0.01"),
+    ],
+)
+def test_the_likely_unit_is_named(scale, max_range, hint):
+    cloud = np.float32(scale) * on_a_sphere(3.0)
+    with pytest.warns(UserWarning, match=f"has 0 of 500 returns between .* {hint}"):
+        assert warn_out_of_range(cloud, 0.5, max_range, 0.01)
+
+
+def on_a_sphere(radius):
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return (radius * directions).astype(np.float32)
+
+
+def padded(cloud):
+    """With many rows that are no returns, and some beyond all ranges."""
+    rows = np.full((20_000, 3), np.nan, np.float32)
+    rows[: len(cloud)] = cloud
+    rows[-3:] = [[np.inf, 0, 0], [3e38, 3e38, 3e38], [-np.inf, np.inf, 1]]
+    return rows
+
+
+@pytest.mark.parametrize("prepared", [np.asarray, padded])
+@pytest.mark.parametrize(("inside", "warns"), [(0, True), (4, True), (5, False), (500, False)])
+def test_returns_outside_the_bounds_are_warned_of(prepared, inside, warns):
+    """Each direction is turned; the bounds hold a sphere of 3 m around the sensor, not of 4 m."""
+    cloud = on_a_sphere(7.0)
+    cloud[500 - inside :] *= 3 / 7
+    pose = moved(np.diag([1.0, -1, -1, 1]), [10.0, 0, 0]).astype(np.float32)
+    bounds = ((6.9, -3.1, -3.1), (13.1, 3.1, 3.1))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_outside(prepared(cloud), pose, bounds, 0.1, 8.0, 0.01)
+        warn_outside(prepared(cloud), pose, bounds, 0.1, 8.0, 0.0)  # switched off
+        warn_outside(prepared(cloud), pose, bounds, 0.1, 1.0, 0.01)  # none is in range
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == warns
+    assert all("less than 1 % of its returns in range inside the bounds" in m for m in messages)

@@ -42,7 +42,8 @@ class Config:
         range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m.
             Hits are averaged with weight 1 / sigma^2.
         min_in_range: A cloud with a smaller share of its returns between min_range and max_range
-            changes nothing and raises `Flag.OUT_OF_RANGE`. With 0 its rays clear space.
+            changes nothing and raises `Flag.OUT_OF_RANGE`. With 0 its rays clear space. Outside
+            jit, `update` warns if a smaller share of the returns in range lies in the bounds.
         most_refusals: Clouds in a row that are refused because they contradict the map; the next
             one is fused. With 0 all clouds are fused.
 

@@ -28,7 +28,15 @@ def frontier_step_m(config: Config) -> float:
 
 
 class Flag(enum.IntFlag):
-    """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`."""
+    """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`.
+
+    Example:
+        >>> flags = hio.Flag(int(state.report.update_flags))
+        >>> hio.Flag.BAD_POSE in flags
+        False
+        >>> print(flags)
+        OUT_OF_RANGE|INCONSISTENT_CLOUD
+    """
 
     BAD_POSE = 1
     """A pose was not finite, not rigid, or 100 km away. That update changed nothing else."""
@@ -37,7 +45,8 @@ class Flag(enum.IntFlag):
     POINTS_OUTSIDE = 4
     """Returns in range fell outside the bounds. Their rays cleared space but left no surface."""
     TRAINING_FAILED = 8
-    """A training step was not finite. The network was kept as it was."""
+    """Training was not finite. The network was kept as it was, and the next update trains it again;
+    the optimizer starts anew if it was the cause."""
     OUT_OF_RANGE = 16
     """Almost no return was in range; see `Config.min_in_range`. That update changed nothing else:
     check the unit, which must be m."""
@@ -48,6 +57,16 @@ class Flag(enum.IntFlag):
     """Inside jit, `robot` or `noise` was not finite or out of range. That update changed nothing
     else."""
 
+    def __str__(self) -> str:
+        """Returns the names of the flags with `|` between them, or "none"."""
+        names = [str(flag.name) for flag in type(self) if flag & self]
+        unknown = int(self) & ~sum(type(self))
+        return "|".join([*names, str(unknown)] if unknown else names) or "none"
+
+    def __format__(self, spec: str) -> str:
+        """Formats the names, as `str` does."""
+        return format(str(self), spec)
+
 
 class Report(flax.struct.PyTreeNode):
     """Summary of the last update; `flags` collects those of all updates.
@@ -56,10 +75,12 @@ class Report(flax.struct.PyTreeNode):
     `refused_in_row`.
 
     Attributes:
-        points_used: Points that were fused into the grid, int32.
-        points_outside: Returns in range that lie outside the bounds, int32.
-        points_out_of_range: Finite points nearer than min_range or farther than max_range, int32.
-        points_invalid: Rows with a NaN or inf, padding included, int32.
+        points_used: Returns that were fused into the grid, int32.
+        points_outside: Returns in range that lie outside the bounds, int32. Stray returns and
+            those on the robot count neither here nor in `points_used`.
+        points_out_of_range: Returns nearer than min_range or farther than max_range, int32.
+        points_invalid: Rows with a NaN or inf, int32. Outside jit the rows count that `update` has
+            added to reach `Config.max_points`, too.
         sdf_loss: Mean |f - s| over the samples in the last epoch, m, float32 (paper, eq. 4).
         eikonal_loss: Mean | |grad f| - 1 | in the last epoch, float32 (paper, eq. 5).
         points_moving: Returns in space that had been free: on things that move or are new, int32.
@@ -267,7 +288,8 @@ class Query(NamedTuple):
         observed: Whether a ray has reached the voxel that contains the point, (...) bool.
         frontier: Distance to the nearest voxel that no ray has reached, (...) float32, m; not
             positive in such voxels.
-        lower: Lower bound of the true distance, calibrated on each new cloud, (...) float32, m.
+        lower: At most the true distance at about 99 % of the points of free space, (...) float32,
+            m. It is calibrated on each new cloud, not guaranteed, and counts unseen space as solid.
     """
 
     sdf: jax.Array

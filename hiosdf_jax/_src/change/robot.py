@@ -10,7 +10,8 @@ from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.numerics.vectors import each, length, split
 
-# Patches in the box around the robot that one update can judge; the others are left to the next.
+# Patches in the box around all spheres that are judged, in the order of their voxels; those beyond
+# stay as they are. The faces of a box of 3 m cross 5,400 voxels of 10 cm and 86,400 of 2.5 cm.
 _MOST_PATCHES = 32_768
 
 

@@ -101,13 +101,15 @@ def fuse_frames(
         last_frame = i
         path_world.append(pose[:3, 3])
         ups_world.append(_up_of_frame(cloud, pose))
+        updates = int(state.updates)
         start = time.perf_counter()
         state = jax.block_until_ready(pipeline.update(state, cloud, pose))
         seconds.append(time.perf_counter() - start)
         if len(seconds) == 1:
             return_freed_memory()
-        points_used += int(state.report.points_used)
-        points_outside += int(state.report.points_outside)
+        if int(state.updates) > updates:  # a refused cloud leaves the numbers of the one before it
+            points_used += int(state.report.points_used)
+            points_outside += int(state.report.points_outside)
         if i % 5 == 0:
             loss_cm = 100 * float(state.report.sdf_loss)
             bar.set_postfix_str(

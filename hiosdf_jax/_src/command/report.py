@@ -21,6 +21,9 @@ _FLAG_WORDS = {
     Flag.EMPTY_CLOUD: "a cloud had no return",
     Flag.POINTS_OUTSIDE: "points in range fell outside the bounds and left no surface",
     Flag.TRAINING_FAILED: "a training step was not finite and was undone",
+    Flag.OUT_OF_RANGE: "a cloud had almost no return in range and was refused: is its unit m?",
+    Flag.INCONSISTENT_CLOUD: "a cloud contradicted the map: check the pose and the sensor",
+    Flag.BAD_ARGUMENT: "the robot's spheres or the noise had bad values",
 }
 
 

@@ -11,8 +11,10 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.numerics.vectors import length, split
 
-# Returns this near to the robot's spheres, m, are on the robot: noise moves them.
+# Returns this near to the robot's spheres are on the robot, because noise moves them: within so
+# many m, or so many standard deviations of their range if that is more.
 _ROBOT_MARGIN_M = 0.03
+_ROBOT_MARGIN_SIGMAS = 3.0
 
 HIDDEN_VOXELS = 4
 """A ray changes no voxel farther than this behind its end."""
@@ -96,11 +98,12 @@ def remove_robot(rays: Rays, centers_world: jax.Array, radii: jax.Array) -> Rays
     Returns:
         The rays; those that end on the robot are not in range.
     """
+    margin = jnp.maximum(_ROBOT_MARGIN_M, _ROBOT_MARGIN_SIGMAS * rays.sigma)
 
     def add(found: jax.Array, sphere: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         center, radius = sphere
         distance = length(split(rays.points_world - center))
-        return found | (distance <= radius + _ROBOT_MARGIN_M), None
+        return found | (distance <= radius + margin), None
 
     found, _ = jax.lax.scan(add, jnp.zeros(rays.ends.shape, bool), (centers_world, radii))
     return rays._replace(in_range=rays.in_range & ~found, ends=rays.ends & ~found)

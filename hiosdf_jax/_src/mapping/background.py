@@ -5,18 +5,28 @@ from __future__ import annotations
 import atexit
 import math
 import threading
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from hiosdf_jax._src.mapping.pipeline import update
-from hiosdf_jax._src.numerics.posed_cloud import as_floats
-from hiosdf_jax._src.state import Field, MapState, check_map, field_of
+from hiosdf_jax._src.numerics.posed_cloud import as_floats, check_extras
+from hiosdf_jax._src.state import Field, Flag, MapState, check_map, field_of
 
 # What `update` raises for a bad frame: the others are faults of the machine or of this library.
 # Warnings are raised where the user has made them errors.
 _BAD_FRAME = (ValueError, TypeError, OverflowError, Warning)
+
+
+class _Frame(NamedTuple):
+    """What `put` hands over."""
+
+    cloud: Any
+    pose: Any
+    stamp: float
+    robot: tuple[Any, Any] | None
+    noise: tuple[Any, Any] | None
 
 
 class BackgroundMapper:
@@ -29,8 +39,10 @@ class BackgroundMapper:
     Attributes:
         field: The newest snapshot, with the stamp of its frame. Reading it never waits.
         dropped: Number of frames that newer ones replaced.
-        rejected: Number of frames that `update` refused.
-        rejection: The exception of the last of them, or None.
+        rejected: Number of frames that left the map as it was: `update` raised an exception or
+            refused them. They leave `field` and its stamp as they were, too.
+        rejection: The exception of the last of them, or None. For a frame that `update` refused it
+            is a ValueError with the names of the flags.
 
     Example:
         >>> with hio.BackgroundMapper(state) as mapper:
@@ -53,7 +65,7 @@ class BackgroundMapper:
         self.rejected = 0
         self.rejection: Exception | None = None
         self._state = state
-        self._waiting: tuple[Any, Any, float] | None = None
+        self._waiting: _Frame | None = None
         self._busy = False
         self._closed = False
         self._failure: BaseException | None = None
@@ -63,13 +75,23 @@ class BackgroundMapper:
         # A thread that runs compiled code while the interpreter ends would crash it.
         atexit.register(self._abandon)
 
-    def put(self, cloud: Any, pose: Any, stamp: float = 0.0) -> None:
+    def put(
+        self,
+        cloud: Any,
+        pose: Any,
+        stamp: float = 0.0,
+        *,
+        robot: tuple[Any, Any] | None = None,
+        noise: tuple[Any, Any] | None = None,
+    ) -> None:
         """Hands a frame over and returns at once.
 
         Args:
-            cloud: As for `update`. Do not change the array afterward.
+            cloud: As for `update`. Do not change this or any other array afterward.
             pose: As for `update`.
             stamp: Time of the frame, s on the caller's clock, counted from the start of the run.
+            robot: As for `update`: the robot's spheres at the time of the cloud.
+            noise: As for `update`.
 
         Raises:
             ValueError: `stamp` is not a finite number.
@@ -87,7 +109,7 @@ class BackgroundMapper:
             if self._closed:
                 raise RuntimeError("the BackgroundMapper is closed")
             self.dropped += self._waiting is not None
-            self._waiting = (cloud, pose, seconds)
+            self._waiting = _Frame(cloud, pose, seconds, robot, noise)
             self._changed.notify_all()
 
     def wait(self) -> MapState:
@@ -142,13 +164,13 @@ class BackgroundMapper:
     def _work(self) -> None:
         try:
             while (frame := self._next()) is not None:
-                self._fuse(*frame)
+                self._fuse(frame)
         except BaseException as failure:
             with self._changed:
                 self._failure = failure
                 self._changed.notify_all()
 
-    def _next(self) -> tuple[Any, Any, float] | None:
+    def _next(self) -> _Frame | None:
         with self._changed:
             self._busy = False
             self._changed.notify_all()
@@ -157,23 +179,33 @@ class BackgroundMapper:
             self._busy = frame is not None
             return frame
 
-    def _fuse(self, cloud: Any, pose: Any, stamp: float) -> None:
+    def _fuse(self, frame: _Frame) -> None:
         try:
-            cloud, pose = as_floats("cloud", cloud), as_floats("pose", pose)
+            cloud, pose = as_floats("cloud", frame.cloud), as_floats("pose", frame.pose)
+            robot, noise = check_extras(frame.robot, frame.noise)
         except Exception as reason:  # whatever an object of the user's raises
-            self.rejected += 1
-            self.rejection = reason
+            self._reject(reason)
             return
         try:
             # Finished before it is published, so that no reader waits for the device. The old state
             # is not donated, so that the old field stays valid without a copy.
-            state = jax.block_until_ready(update(self._state, cloud, pose))
+            state = jax.block_until_ready(
+                update(self._state, cloud, pose, robot=robot, noise=noise)
+            )
         except _BAD_FRAME as reason:
-            self.rejected += 1
-            self.rejection = reason
+            self._reject(reason)
             return
+        fused = int(state.updates) > int(self._state.updates)
         self._state = state
-        self.field = field_of(state).replace(stamp=jax.numpy.float32(stamp))
+        if fused:
+            self.field = field_of(state).replace(stamp=jax.numpy.float32(frame.stamp))
+        else:
+            flags = Flag(int(state.report.update_flags))
+            self._reject(ValueError(f"update refused the frame and raised the flags {flags}"))
+
+    def _reject(self, reason: Exception) -> None:
+        self.rejected += 1
+        self.rejection = reason
 
     def _check(self) -> None:
         if self._failure is not None:

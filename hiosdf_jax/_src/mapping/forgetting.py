@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,23 +22,27 @@ def forget(state: MapState, box: Any) -> MapState:
 
     For a change that is known before a sensor sees it: a door that was opened, a pallet that was
     taken away. Distances, frontier and lower bounds follow at once, the network with the next
-    updates.
+    updates. Unobserved is not free: with `unknown="obstacle"`, and in `lower`, the inside is solid
+    until a sensor has seen it.
 
     Args:
         state: The map. Not inside jit.
-        box: ((x0, y0, z0), (x1, y1, z1)) m, world frame. Voxels whose centers lie in it are
-            forgotten; it may reach beyond the bounds.
+        box: ((x0, y0, z0), (x1, y1, z1)) m, world frame, concrete numbers. Whole voxels are
+            forgotten: those whose centers lie in it. It may reach beyond the bounds.
 
     Returns:
         The map without this knowledge. It shares memory with the old map.
 
     Raises:
-        ValueError: `state` is not a map, or `box` is not two finite, ascending corners.
+        ValueError: `state` is not a map, or `box` is not two finite, ascending corners, or is
+            traced.
 
     Example:
         >>> state = hio.forget(state, ((1.0, 0.0, 0.0), (2.0, 0.2, 2.1)))
     """
     check_map(state)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(box)):
+        raise ValueError("box is traced, expected concrete numbers: call forget outside jit")
     try:
         corners = np.asarray(box, np.float32)
     except (TypeError, ValueError):

@@ -9,23 +9,36 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.change.novelty import compare_cloud
-from hiosdf_jax._src.grid.rays import place_cloud
+from hiosdf_jax._src.mapping.stages import CHECKS, begin, run_stages
 from hiosdf_jax._src.numerics.posed_cloud import as_floats, check_extras, check_pose, check_shapes
 from hiosdf_jax._src.state import MapState, check_map
 
 
 def moving_rows(
-    state: MapState, cloud: Any, pose: Any, *, noise: tuple[Any, Any] | None = None
+    state: MapState,
+    cloud: Any,
+    pose: Any,
+    *,
+    robot: tuple[Any, Any] | None = None,
+    noise: tuple[Any, Any] | None = None,
 ) -> jax.Array:
-    """Finds the returns of a cloud that are on moving or new things: in space that was seen free.
+    """Finds the returns of a cloud that are on moving or new things.
 
-    Ask before the cloud is fused, with the map that `update` takes.
+    Ask before the cloud is fused, with the map and the arguments that `update` takes. Marked are
+
+    - returns in space that was seen free, away from all surfaces; `Report.points_moving` counts
+      these alone
+    - returns on or next to a surface that is itself new: it appeared in the last few scans.
+
+    Returns that `update` leaves out are not marked: those on the robot, stray ones, and those out
+    of range or outside the bounds. In a static scene a few returns can be marked too, on things
+    that come into view, such as an edge or a thin part that earlier rays have passed.
 
     Args:
         state: The map before the cloud.
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
         pose: (4, 4) T_world_sensor, rigid.
+        robot: As for `update`.
         noise: As for `update`.
 
     Returns:
@@ -33,33 +46,37 @@ def moving_rows(
 
     Raises:
         ValueError: An argument has a wrong type or shape. Outside jit also: the pose is not finite
-            or not rigid, or a value of `noise` is out of range.
+            or not rigid, or a value of `robot` or `noise` is out of range.
 
     Example:
         >>> moving = hio.moving_rows(state, cloud, pose)
         >>> state = hio.update(state, cloud, pose)
     """
     check_map(state)
-    _, sigma = check_extras(None, noise)
+    extras = check_extras(robot, noise)
     check_shapes(cloud, pose)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((state, cloud, pose))):
-        return _moving_rows(state, jnp.asarray(cloud), jnp.asarray(pose), sigma)
+    leaves = (*jax.tree.leaves((state, extras)), cloud, pose)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return _moving_rows(state, jnp.asarray(cloud), jnp.asarray(pose), *extras)
     floats = as_floats("cloud", cloud)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
     rows, step = np.shape(cloud)[0], state.config.max_points
     padded = np.full((-(-max(rows, 1) // step) * step, 3), np.nan, np.float32)
     padded[:rows] = floats
-    return _moving_rows_jit(state, padded, check_pose(pose), sigma)[:rows]
+    return _moving_rows_jit(state, padded, check_pose(pose), *extras)[:rows]
 
 
 def _moving_rows(
-    state: MapState, cloud: jax.Array, pose: jax.Array, noise: jax.Array | None
+    state: MapState,
+    cloud: jax.Array,
+    pose: jax.Array,
+    robot: tuple[jax.Array, jax.Array] | None,
+    noise: jax.Array | None,
 ) -> jax.Array:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    rays = place_cloud(state.config, cloud, finite, pose, noise)
-    found = compare_cloud(state.config, state.grid, rays, state.updates)
-    return found.novel | found.near_new
+    checked = run_stages(begin(state, cloud, finite, pose, robot, noise), CHECKS)
+    return checked.novelty.novel | checked.novelty.near_new
 
 
 _moving_rows_jit = jax.jit(_moving_rows)

@@ -27,6 +27,7 @@ from hiosdf_jax._src.numerics.posed_cloud import (
     check_shapes,
     prepare,
     warn_out_of_range,
+    warn_outside,
 )
 from hiosdf_jax._src.state import Field, MapState, Report, check_map, field_of
 
@@ -102,9 +103,11 @@ def update(
             The old map, its `report` and a `BackgroundMapper` that began with it become invalid.
             Results of `snapshot`, `bake` and `grow` stay valid. A ValueError donates nothing.
             Inside jit this has no effect: donate the arguments of the outer function instead.
-        robot: Centers (K, 3) m, world frame, and radii (K,) m of spheres that cover the robot, for
-            instance from `planning.place_spheres`. Returns within 3 cm of them leave no surface and
-            clear no space.
+        robot: Centers (K, 3) m and radii (K,) m of spheres that cover the robot, for instance from
+            `planning.place_spheres`. The centers are in the world frame, at the time of the cloud.
+            Returns on them leave no surface and clear no space: those within 3 cm, or three
+            standard deviations of their range if that is more. Surfaces that were mapped inside
+            the spheres are removed, and their space counts as free.
         noise: (a, b) of the standard deviation a + b r^2 of this cloud's returns at range r, m and
             1/m, for sensors of different quality. By default it is `config.range_noise`. Where it
             is given and exceeds a fifth of a voxel, ranges are averaged over neighboring rays.
@@ -115,7 +118,13 @@ def update(
     Raises:
         ValueError: A shape is wrong. Outside jit also: the pose is not finite, not rigid or farther
             than 100 km from the origin, the cloud has no finite row, or a value of `robot` or
-            `noise` is out of range.
+            `noise` is out of range, such as a radius above 5 m.
+
+    Warns:
+        UserWarning: Outside jit, if almost no return is in range, which refuses the cloud, or
+            almost none of those in range lies in the bounds. A cloud that is refused because it
+            contradicts the map causes no warning, since that would wait for the device: read
+            `state.report.update_flags`, or whether `state.updates` has grown.
 
     Example:
         >>> for cloud, pose in stream:
@@ -130,7 +139,9 @@ def update(
     compiled = _update_donating if donate else _update_jit
     config = state.config
     cloud, pose = prepare(cloud, pose, config.max_points)
-    warn_out_of_range(cloud, config.min_range, config.max_range, config.min_in_range)
+    limits = (config.min_range, config.max_range, config.min_in_range)
+    if not warn_out_of_range(cloud, *limits):
+        warn_outside(cloud, pose, config.bounds, *limits)
     return compiled(state, cloud, pose, *extras)
 
 

@@ -55,6 +55,7 @@ class Step(NamedTuple):
         robot: Centers (K, 3) and radii (K,) of the robot's spheres, m, world frame, or None.
         noise: (a, b) of the cloud's noise, or None for that of the configuration.
         flags: Bits of `Flag` of this update, () uint32.
+        out_of_range: Returns nearer than min_range or farther than max_range, () int32.
         rays: The cloud in the world frame.
         novelty: The cloud compared with the map before it.
         before: The evidence around the sensor before this cloud, float32.
@@ -72,6 +73,7 @@ class Step(NamedTuple):
     robot: tuple[jax.Array, jax.Array] | None = None
     noise: jax.Array | None = None
     flags: jax.Array = _LATER
+    out_of_range: jax.Array = _LATER
     rays: Rays = _LATER
     novelty: novelty.Novelty = _LATER
     before: evidence.EvidenceWindow = _LATER
@@ -113,10 +115,11 @@ def place_cloud(step: Step) -> Step:
     config = step.config
     placed = rays.place_cloud(config, step.cloud, step.finite, step.pose, step.noise)
     usable, returns = jnp.sum(placed.ends), jnp.sum(step.finite)
-    out_of_range = (step.flags == 0) & (usable < config.min_in_range * returns)
+    too_few = (step.flags == 0) & (usable < config.min_in_range * returns)
     if step.robot is not None:
         placed = rays.remove_robot(placed, *step.robot)
-    return _flag(step._replace(rays=placed), Flag.OUT_OF_RANGE, out_of_range)
+    step = step._replace(rays=placed, out_of_range=(returns - usable).astype(jnp.int32))
+    return _flag(step, Flag.OUT_OF_RANGE, too_few)
 
 
 def drop_stray(step: Step) -> Step:
@@ -237,7 +240,7 @@ def summarize(step: Step) -> Step:
     report = Report(
         points_used=count(ends & inside),
         points_outside=count(outside),
-        points_out_of_range=count(step.finite & ~ends),
+        points_out_of_range=step.out_of_range,
         points_invalid=count(~step.finite),
         sdf_loss=step.losses.sdf,
         eikonal_loss=step.losses.eikonal,

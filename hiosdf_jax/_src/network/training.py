@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -112,9 +113,10 @@ def train(
         key: Source of randomness, for the order of the samples.
 
     Returns:
-        network: The trained network; unchanged if training was not finite.
+        network: The trained network; unchanged if training was not finite. An optimizer that was
+            not finite before is then started anew: otherwise no later training would be finite.
         parts: The mean losses of the last epoch.
-        finite: Whether losses and weights are finite, () bool.
+        finite: Whether losses, weights and the optimizer are finite, () bool.
     """
     optimizer = _optimizer(config)
     batches = _split(config, samples, key)
@@ -157,9 +159,7 @@ def train(
             0, least, lambda number, carry: epoch(extra_epochs + number, carry), extra
         )
 
-    finite = jnp.isfinite(parts.sdf + parts.eikonal) & jnp.all(
-        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(params)])
-    )
+    finite = _is_finite((parts, params, state))
     mean = jax.tree.map(
         lambda old, new: average * old + (1 - average) * new, network.average, params
     )
@@ -167,8 +167,16 @@ def train(
     residual = siren.predict(config, mean, points) - samples.sdf
     mean = siren.shift_output(config, mean, -_median(residual, samples.weight))
     trained = network.replace(params=params, average=mean, optimizer=state)
-    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), trained, network)
-    return kept, parts, finite
+    usable, fresh = _is_finite(network.optimizer), optimizer.init(network.params)
+    old = network.replace(
+        optimizer=jax.tree.map(partial(jnp.where, usable), network.optimizer, fresh)
+    )
+    return jax.tree.map(partial(jnp.where, finite), trained, old), parts, finite
+
+
+def _is_finite(tree: Any) -> jax.Array:
+    """Returns whether all numbers of a tree are finite, () bool."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
 def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:

@@ -11,12 +11,16 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.rigid import is_rigid
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
+_TRIED_ROWS = 2000  # of a cloud that almost certainly has returns inside the bounds
 
 LEAST_NOISE_M = 1e-4
 """Smaller noise would give a return a weight that float16 cannot hold."""
+
+LARGEST_RADIUS_M = 5.0
+"""Larger spheres of a robot are in millimeters, or a mistake that would empty the map."""
 
 
 def check_shapes(cloud: Any, pose: Any) -> None:
@@ -55,10 +59,7 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
             f"{_printed(matrix)}"
         )
     if not is_rigid(matrix, np):
-        raise ValueError(
-            f"{prefix}pose is not rigid, expected a rotation and a translation of at most 100 km: "
-            f"{_printed(matrix)}"
-        )
+        raise ValueError(f"{prefix}pose {_pose_fault(matrix)}: {_printed(matrix)}")
     return matrix
 
 
@@ -94,7 +95,7 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
         noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m, or None.
 
     Returns:
-        The arguments as float32 arrays, or None.
+        The arguments as float32 arrays, or None. A robot of no spheres is None.
 
     Raises:
         ValueError: A shape is wrong, or a value is not finite or out of range.
@@ -110,9 +111,11 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
                 f"robot has centers of shape {shapes[0]} and radii of shape {shapes[1]}, "
                 "expected (K, 3) and (K,)"
             )
-        _check_values("robot centers", centers, -np.inf)
-        _check_values("robot radii", radii, 0)
-        robot = (jnp.asarray(centers, jnp.float32), jnp.asarray(radii, jnp.float32))
+        robot = None
+        if shapes[0][0] > 0:
+            _check_values("robot centers", centers, -np.inf)
+            _check_values("robot radii", radii, 0, LARGEST_RADIUS_M)
+            robot = (jnp.asarray(centers, jnp.float32), jnp.asarray(radii, jnp.float32))
     if noise is not None:
         # Tracers in a tuple have no shape of their own.
         shape = (len(noise),) if isinstance(noise, tuple | list) else np.shape(noise)
@@ -132,22 +135,24 @@ def extras_are_valid(
     valid = jnp.asarray(True)
     if robot is not None:
         centers, radii = robot
-        valid &= jnp.isfinite(centers).all() & (jnp.isfinite(radii) & (radii >= 0)).all()
+        valid &= jnp.isfinite(centers).all()
+        valid &= ((radii >= 0) & (radii <= LARGEST_RADIUS_M)).all()  # False for NaN
     if noise is not None:
         least = jnp.asarray([LEAST_NOISE_M, 0.0], jnp.float32)
         valid &= (jnp.isfinite(noise) & (noise >= least)).all()
     return valid
 
 
-def _check_values(name: str, values: Any, least: float) -> None:
+def _check_values(name: str, values: Any, least: float, most_m: float = np.inf) -> None:
     if isinstance(values, jax.core.Tracer):
         return
     array = as_floats(name, values)
+    came = f"{name} has values from {array.min()} to {array.max()}, expected"
     if not (np.isfinite(array).all() and (array >= np.float32(least)).all()):
         expected = "finite values" if least == -np.inf else f"finite values >= {least:.3g}"
-        raise ValueError(
-            f"{name} has values from {array.min()} to {array.max()}, expected {expected}"
-        )
+        raise ValueError(f"{came} {expected}")
+    if (array > most_m).any():
+        raise ValueError(f"{came} meters, at most {most_m:g}; are they in millimeters?")
 
 
 def finite_rows(cloud: Any) -> np.ndarray:
@@ -206,7 +211,7 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
 
 def warn_out_of_range(
     cloud: np.ndarray, min_range: float, max_range: float, min_share: float
-) -> None:
+) -> bool:
     """Warns of a cloud with almost no return in range, and names the likely unit.
 
     Args:
@@ -214,25 +219,79 @@ def warn_out_of_range(
         min_range: Least range of a return that counts, m.
         max_range: Largest range of a return that counts, m.
         min_share: Least share of the returns that must be in range.
+
+    Returns:
+        Whether it warned.
     """
-    x, y, z = cloud.T.astype(np.float64)  # a finite row must not overflow
-    square = x * x + y * y + z * z
+    square = _square_ranges(cloud)
     square = square[np.isfinite(square)]
     usable = np.count_nonzero((square >= min_range**2) & (square <= max_range**2))
     if usable >= min_share * len(square):
-        return
+        return False
     middle = float(np.sqrt(np.median(square)))
-    unit = "millimeters" if min_range <= middle / 1000 <= max_range else "m"
+    units = {"centimeters": 100, "millimeters": 1000}
+    likely = [unit for unit, per_m in units.items() if min_range <= middle / per_m <= max_range]
     warnings.warn(
         f"cloud has {usable} of {len(square)} returns between min_range, {min_range:g} m, and "
         f"max_range, {max_range:g} m; the median range is {middle:.3g} m. The map ignores it. "
         + (
-            "It looks like millimeters, expected m"
-            if unit != "m"
+            f"It looks like {' or '.join(likely)}, expected m"
+            if likely
             else f"Its unit must be m; Config.min_in_range is {min_share:g}"
         ),
         stacklevel=3,
     )
+    return True
+
+
+def warn_outside(
+    cloud: np.ndarray,
+    pose: np.ndarray,
+    bounds: Any,
+    min_range: float,
+    max_range: float,
+    min_share: float,
+) -> None:
+    """Warns of a cloud with almost no return inside the bounds, among those in range.
+
+    Args:
+        cloud: (N, 3) m, sensor frame; rows with a NaN are no returns.
+        pose: (4, 4) T_world_sensor.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame.
+        min_range: Least range of a return that counts, m.
+        max_range: Largest range of a return that counts, m.
+        min_share: Least share of the returns in range that must lie inside.
+    """
+
+    def count(rows: np.ndarray) -> tuple[int, int]:
+        """Counts the returns in range, and those of them inside."""
+        square = _square_ranges(rows)
+        inside = in_range = (square >= min_range**2) & (square <= max_range**2)
+        with np.errstate(over="ignore", invalid="ignore"):  # rows that are not in range
+            for k in range(3):
+                world = rows @ pose[k, :3] + pose[k, 3]
+                inside = inside & (world >= bounds[0][k]) & (world <= bounds[1][k])
+        return int(np.count_nonzero(in_range)), int(np.count_nonzero(inside))
+
+    some_in_range, some_inside = count(cloud[:: -(-len(cloud) // _TRIED_ROWS)])
+    if some_inside and some_inside >= min_share * some_in_range:
+        return
+    in_range, inside = count(cloud)
+    if inside >= min_share * in_range:
+        return
+    # Without numbers of this cloud: Python shows an equal message once, and not at 30 Hz.
+    warnings.warn(
+        f"cloud has less than {100 * min_share:g} % of its returns in range inside the bounds, "
+        f"{bounds}: is the pose wrong, the cloud in the world frame, or the box too small? Its "
+        "rays clear space, but those returns leave no surface. Config.min_in_range=0 turns this "
+        "warning off",
+        stacklevel=3,
+    )
+
+
+def _square_ranges(cloud: np.ndarray) -> np.ndarray:
+    x, y, z = cloud.T.astype(np.float64)  # a finite row must not overflow
+    return x * x + y * y + z * z
 
 
 def _check_cloud_shape(cloud: Any) -> None:
@@ -243,6 +302,25 @@ def _check_cloud_shape(cloud: Any) -> None:
 def _check_pose_shape(pose: Any, prefix: str = "") -> None:
     if np.shape(pose) != (4, 4):
         raise ValueError(f"{prefix}pose has shape {np.shape(pose)}, expected (4, 4)")
+
+
+def _pose_fault(pose: np.ndarray) -> str:
+    """Says in words why a finite pose is refused."""
+    rotation, position = pose[:3, :3].astype(np.float64), pose[:3, 3].astype(np.float64)
+    gram = rotation.T @ rotation
+    lengths = np.sqrt(np.diag(gram))
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        hint = "; is it transposed?" if is_rigid(pose.T, np) else ""
+        return f"is not rigid: its last row is {_printed(pose[3])}, expected [0, 0, 0, 1]{hint}"
+    if np.abs(lengths**2 - 1).max() > TOLERANCE:
+        length = f"{lengths[0]:.4g}" if np.ptp(lengths) <= TOLERANCE else _printed(lengths)
+        return f"is not rigid: its columns have length {length}, expected 1"
+    if np.linalg.det(rotation) < 0:
+        return "is not rigid: its determinant is -1, expected 1; it mirrors the cloud"
+    if np.abs(position).max() > FARTHEST_M:
+        kilometers = np.linalg.norm(position) / 1000
+        return f"is {kilometers:.4g} km from the origin, expected at most {FARTHEST_M / 1000:g} km"
+    return "is not rigid: its columns are not perpendicular, expected a rotation"
 
 
 def _printed(matrix: np.ndarray) -> str:

@@ -6,11 +6,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-# Largest coordinate of a position, m; float32 resolves 8 mm there.
-_FARTHEST_M = 1e5
+FARTHEST_M = 1e5
+"""Largest coordinate of a position, m; float32 resolves 8 mm there."""
 
-# Largest deviation of R^T R from the identity; real trajectories have few digits.
-_TOLERANCE = 5e-3
+TOLERANCE = 5e-3
+"""Largest deviation of R^T R from the identity; real trajectories have few digits."""
 
 
 def is_rigid(pose: Any, np: Any = jnp) -> Any:
@@ -27,7 +27,7 @@ def is_rigid(pose: Any, np: Any = jnp) -> Any:
     # Sums of products by hand: a matrix product may run in reduced precision on a GPU.
     gram = np.sum(rotation[:, :, None] * rotation[:, None, :], axis=0)
     handed = np.sum(np.cross(rotation[0], rotation[1]) * rotation[2])
-    orthonormal = np.all(np.abs(gram - np.eye(3)) <= _TOLERANCE)
+    orthonormal = np.all(np.abs(gram - np.eye(3)) <= TOLERANCE)
     last_row = np.all(np.abs(pose[3] - np.array([0.0, 0, 0, 1])) <= 1e-6)
-    near = np.all(np.abs(pose[:3, 3]) <= _FARTHEST_M)
+    near = np.all(np.abs(pose[:3, 3]) <= FARTHEST_M)
     return orthonormal & last_row & (handed > 0) & near & np.all(np.isfinite(pose))
