@@ -153,3 +153,24 @@ def test_nearest_ranges_spread_only_to_pixels_that_no_ray_has_measured(images):
     np.testing.assert_array_equal(result[~unmeasured], values[~unmeasured])
     assert np.isinf(values[~unmeasured]).sum() > 300
     assert np.isfinite(result).sum() > 5 * np.isfinite(values).sum()
+
+
+@pytest.mark.parametrize(
+    ("ranges", "least", "most"),
+    [("equal", 0.99, 1.0), ("edge", 0.9, 0.99), ("random", 0.0, 0.05), ("sparse", -1.0, -1.0)],
+)
+def test_neighboring_rays_are_alike_in_a_view_and_not_in_noise(ranges, least, most):
+    ahead = random_directions(7, 40_000)
+    ahead = ahead[ahead[:, 2] > 0]
+    rng, count = np.random.default_rng(8), len(ahead)
+    length = {
+        "equal": 2 + 0.01 * rng.normal(size=count),
+        "edge": np.where(ahead[:, 0] > 0.1, 1.0, 3.0) + 0.01 * rng.normal(size=count),
+        "random": rng.uniform(0.5, 5, count),
+        "sparse": rng.uniform(0.5, 5, count),
+    }[ranges]
+    rays = rays_to(length[:, None] * ahead, (0, 0, 0))
+    chosen = jnp.arange(count) < (300 if ranges == "sparse" else count)
+    rays = rays._replace(in_range=chosen)
+    share = float(jax.jit(directions.smoothness)(rays, chosen))
+    assert least <= share <= most

@@ -176,7 +176,12 @@ def renew(count, near_new=False, novel=True, passes=40.0, hits=0.0, change=0, be
     new = float(beside)
     moved = jnp.abs(window.passes[CELL]) + new if beside else window.passes[CELL]
     window = window._replace(passes=window.passes.at[CELL].set(moved))
-    found = Novelty(jnp.asarray(ended & novel), jnp.asarray(ended & near_new), jnp.asarray(True))
+    found = Novelty(
+        novel=jnp.asarray(ended & novel),
+        near_new=jnp.asarray(ended & near_new),
+        consistent=jnp.asarray(True),
+        noise=jnp.asarray(False),
+    )
     result, fresh = add_new(CONFIG, start, window, rays, found)
     others = np.ones(SHAPE, bool)
     others[CELL] = False

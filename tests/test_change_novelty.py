@@ -144,6 +144,9 @@ def clouds():
         "the same": (walls, True),
         "noise": (moved(0.005 * rng.normal(size=(600, 1))), True),
         "a moving thing": (np.where(some < 0.3, CENTER + 0.2 * (walls - CENTER), walls), True),
+        "twice as long": (SENSOR + 2 * ahead, False),
+        "in feet": (SENSOR + 3.28 * ahead, False),
+        "through one wall": (np.where(walls[:, :1] > 0.76, SENSOR + 2 * ahead, walls), True),
         "a blob": (CENTER + 0.2 * (walls - CENTER), False),
         "a thing in front of the sensor": (
             np.where(some < 0.7, CENTER + 0.2 * (walls - CENTER), walls),
@@ -164,6 +167,45 @@ def test_a_cloud_that_contradicts_the_map_is_found(grid, name):
     beyond = uniform(6, 4000, (0.83, 0.01, 0.21), (0.89, 0.99, 0.99))
     few = rays_to(np.concatenate([points, beyond]), SENSOR)
     assert bool(compare(grid, few).consistent)
+
+
+def test_rays_beyond_the_bounds_and_out_of_range_go_through_walls_too(grid):
+    ahead = on_walls() - SENSOR
+    for factor, ends in ((2, False), (20, False)):
+        rays = rays_to(SENSOR + factor * ahead, SENSOR, hit=ends)
+        outside = rays._replace(inside=jnp.zeros(600, bool))
+        assert not bool(compare(grid, outside).consistent)
+
+
+def test_rays_through_what_is_new_itself_contradict_nothing(grid):
+    rays = rays_to(SENSOR + 2 * (on_walls() - SENSOR), SENSOR)
+    new = grid.evidence.replace(change=jnp.full(SHAPE, 3, jnp.int8))
+    assert bool(compare(grid.replace(evidence=new), rays).consistent)
+
+
+def dense_view(share, kind):
+    """20,000 returns toward the x walls; those beyond a part of the view are on something else."""
+    rng = np.random.default_rng(8)
+    ahead = np.stack([np.ones(20_000), *rng.uniform(-0.6, 0.6, (2, 20_000))], axis=1)
+    covered = ahead[:, 1] < -0.6 + 1.2 * share
+    reach = ((HALF * np.sign(ahead) - (SENSOR - CENTER)) / ahead).min(axis=1)
+    other = {"board": 0.15, "random": rng.uniform(0.02, 0.8, 20_000), "scaled": 0.35 * reach}
+    return rays_to(SENSOR + ahead * np.where(covered, other[kind], reach)[:, None], SENSOR)
+
+
+@pytest.mark.parametrize(
+    ("share", "kind", "consistent", "noise"),
+    [
+        (0.0, "board", True, False),
+        (0.8, "board", True, False),  # a thing that fills most of the view
+        (1.0, "board", False, False),  # a covered lens: nothing beside it agrees
+        (1.0, "scaled", False, False),
+        (1.0, "random", False, True),
+    ],
+)
+def test_a_thing_that_fills_the_view_is_news_and_noise_is_not(grid, share, kind, consistent, noise):
+    found = compare(grid, dense_view(share, kind))
+    assert (bool(found.consistent), bool(found.noise)) == (consistent, noise)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +244,8 @@ def test_invalid_rows_change_nothing(grid):
     found = compare(grid, rays)
     count = len(points)
     others = np.concatenate([inner_points(10, 400, 0.3), np.full((200, 3), 7.0)])
-    padded = rays_to(np.concatenate([points, others]), SENSOR, hit=np.arange(count + 600) < count)
+    real = np.arange(count + 600) < count
+    padded = rays_to(np.concatenate([points, others]), SENSOR, hit=real)._replace(in_range=real)
     again = compare(grid, padded)
     assert arrays_equal(found.novel, again.novel[:count])
     assert bool(again.consistent) == bool(found.consistent)

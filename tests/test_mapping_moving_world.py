@@ -10,6 +10,7 @@ import pytest
 from room import CONFIG, HALF, arrays_equal, room_cloud
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.change import novelty
 from hiosdf_jax._src.mapping import stages
 
 # A box that stands in the room for a while, and where the sensor looks at it from.
@@ -112,6 +113,15 @@ def contradiction(k=0):
     return 0.3 * cloud, pose
 
 
+@pytest.mark.parametrize("factor", [2.0, 3.28])
+def test_a_cloud_that_is_too_long_is_refused_and_not_one_that_is_right(sharp_map, factor):
+    """It would clear space through the walls."""
+    cloud, pose = room_cloud(55)
+    after = hio.update(sharp_map, factor * cloud, pose)
+    assert arrays_equal(after, flagged(sharp_map, hio.Flag.INCONSISTENT_CLOUD, refused=1))
+    assert int(hio.update(after, cloud, pose).report.update_flags) == 0
+
+
 def flagged(state, flag, refused=0):
     """The same map with the flags of a cloud that was not fused."""
     report, flag = state.report, jnp.uint32(flag)
@@ -184,6 +194,25 @@ def test_the_configuration_says_how_many_clouds_are_refused(sharp_map, most, ref
     found, flags = check(state, *contradiction())
     assert bool(found) == accepted
     assert int(flags) == hio.Flag.INCONSISTENT_CLOUD
+
+
+def test_noise_is_never_believed(sharp_map):
+    """A cloud that is no view of any world stays refused, however many came before it."""
+    cloud, pose = contradiction()
+    for most, refused, noise, accepted in (
+        (10, 10, False, True),
+        (10, 10, True, False),
+        (10, 10_000, True, False),
+        (0, 0, True, True),
+    ):
+        state = sharp_map.replace(
+            config=dataclasses.replace(CONFIG, most_refusals=most),
+            report=sharp_map.report.replace(refused_in_row=jnp.int32(refused)),
+        )
+        step = stages.begin(state, jnp.asarray(cloud), jnp.ones(len(cloud), bool), pose)
+        found = novelty.Novelty(*4 * [jnp.asarray(False)])._replace(noise=jnp.asarray(noise))
+        flags = jnp.uint32(hio.Flag.INCONSISTENT_CLOUD)
+        assert bool(stages.is_accepted(step._replace(novelty=found, flags=flags))) == accepted
 
 
 def test_flags_of_the_last_update_and_of_all(sharp_map):

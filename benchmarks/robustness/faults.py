@@ -32,6 +32,7 @@ _POOR_NOISE = 0.05  # m
 _LENS = 0.12  # m, how near the thing is that covers the lens
 _THROUGH_CLEAR, _THROUGH_TRUTH = 0.1, 0.05  # m, called clear and truly near
 _LOWER_EXCESS = 0.005  # m
+_FEET = 3.28  # per m
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -128,24 +129,14 @@ def _out_of_range(setup: Setup, stream: Stream, clean: Clean) -> Rows:
     """The whole stream, and then all of it again, so scaled that no return is in range."""
     label = "then all beyond max_range"
     played = _play(setup, stream, clean.whole, _in_millimeters(stream.frames), label)
-    sdf = library.sdf(played.state, stream.points)
-    lower = library.lower(played.state, stream.points)
-    through = (sdf > _THROUGH_CLEAR) & (stream.truth < _THROUGH_TRUTH)
-    return {
-        f"{stream.name}: {label}": _score(stream, clean, played.state)
-        | _alarm(clean, played)
-        | {
-            "through_walls": float(np.mean(through)),
-            "lower_excess": float(np.mean(lower > stream.truth + _LOWER_EXCESS)),
-        }
-    }
+    return {f"{stream.name}: {label}": _score(stream, clean, played.state) | _alarm(clean, played)}
 
 
-def _random_clouds(stream: Stream, rng: np.random.Generator) -> list[Frame]:
+def _random_clouds(stream: Stream, rng: np.random.Generator, count: int) -> list[Frame]:
     pose = stream.frames[_BURST_AFTER - 1].pose
     low, high = np.array(stream.bounds)
     frames = []
-    for _ in range(10):
+    for _ in range(count):
         points_world = rng.uniform(low, high, (20_000, 3))
         cloud = (points_world - pose[:3, 3]) @ pose[:3, :3]
         frames.append(Frame(cloud.astype(np.float32), pose))
@@ -180,10 +171,11 @@ def _far_pose(stream: Stream, rng: np.random.Generator) -> list[Frame]:
 
 
 BURSTS: dict[str, Callable[[Stream, np.random.Generator], list[Frame]]] = {
-    "10 random clouds": _random_clouds,
-    "10 clouds in millimeters": lambda stream, _: _in_millimeters(
-        stream.frames[_BURST_AFTER - 10 : _BURST_AFTER]
-    ),
+    "10 random clouds": lambda stream, rng: _random_clouds(stream, rng, 10),
+    "30 random clouds": lambda stream, rng: _random_clouds(stream, rng, 30),
+    "10 clouds in millimeters": lambda stream, _: _scaled(stream, 1000),
+    "10 clouds 1.3 times as long": lambda stream, _: _scaled(stream, 1.3),
+    "10 clouds in feet": lambda stream, _: _scaled(stream, _FEET),
     "5 frames 1 m off": _displaced,
     "lens covered for 5 frames": _covered,
     "a pose 1e20 m away": _far_pose,
@@ -242,6 +234,11 @@ STEADY: dict[str, tuple[Spoil, Callable[[int], Any]]] = {
 }
 
 
+def _scaled(stream: Stream, factor: float) -> list[Frame]:
+    frames = stream.frames[_BURST_AFTER - 10 : _BURST_AFTER]
+    return [frame._replace(cloud=(factor * frame.cloud).astype(np.float32)) for frame in frames]
+
+
 def _in_millimeters(frames: Sequence[Frame]) -> list[Frame]:
     return [frame._replace(cloud=1000 * frame.cloud) for frame in frames]
 
@@ -259,10 +256,17 @@ def _play(
 
 
 def _score(stream: Stream, clean: Clean, state: hio.MapState) -> measures.Figures:
+    sdf = library.sdf(state, stream.points)
+    lower = library.lower(state, stream.points)
+    through = (sdf > _THROUGH_CLEAR) & (stream.truth < _THROUGH_TRUTH)
     return (
         measures.error_ratio(state, clean.whole, stream.points, stream.truth)
         | measures.bounds_hold(state, stream.points, stream.truth)
-        | {"finite": float(library.is_finite(state))}
+        | {
+            "finite": float(library.is_finite(state)),
+            "through_walls": float(np.mean(through)),
+            "lower_excess": float(np.mean(lower > stream.truth + _LOWER_EXCESS)),
+        }
     )
 
 

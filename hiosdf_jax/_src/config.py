@@ -40,7 +40,8 @@ class Config:
         min_range: Nearer returns are ignored, m.
         max_range: Farther returns only clear their ray up to this range, m.
         range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m.
-            Hits are averaged with weight 1 / sigma^2.
+            Hits are averaged with weight 1 / sigma^2. A thing that appears is new from three of
+            these and 1.5 voxels before known surfaces: 0.65 m at 9 m.
         min_in_range: A cloud with a smaller share of its returns between min_range and max_range
             changes nothing and raises `Flag.OUT_OF_RANGE`. With 0 its rays clear space. Outside
             jit, `update` warns if a smaller share of the returns in range lies in the bounds.

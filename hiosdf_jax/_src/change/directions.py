@@ -27,6 +27,14 @@ _GAP_PIXELS = (1, 2)
 _DENSE_PIXELS = 3
 _DENSE_SHARE = 0.6
 
+# Ranges around a pixel are similar up to this ratio. Sparse clouds have few pixels with several
+# rays around them, and nothing can be said of them.
+_SIMILAR = 1.2
+_LEAST_PIXELS = 200
+
+UNKNOWN = -1.0
+"""`smoothness` of a cloud that is too sparse for it."""
+
 
 class RangeImage(NamedTuple):
     """Ranges by direction.
@@ -165,6 +173,26 @@ def dense_parts(rays: Rays, chosen: jax.Array) -> jax.Array:
     ours, all_rays = _pool(counts.reshape(2, EDGE, EDGE), 0.0, jax.lax.add, _DENSE_PIXELS)
     dense = (ours > _DENSE_SHARE * all_rays).astype(jnp.float32)
     return _pool(dense, 0.0, jax.lax.max, _DENSE_PIXELS).ravel() > 0
+
+
+def smoothness(rays: Rays, chosen: jax.Array) -> jax.Array:
+    """Computes how similar the ranges of neighboring rays are.
+
+    Args:
+        rays: The cloud.
+        chosen: Its rows of interest, (N,) bool.
+
+    Returns:
+        Of the pixels with chosen rays, and with several ranges in the 3 x 3 pixels around: the
+        share where these are within 20 %, () float32; `UNKNOWN` if there are few such pixels.
+    """
+    image = range_image(rays, rays.in_range)
+    both = jnp.stack([image.nearest, -image.farthest]).reshape(2, EDGE, EDGE)
+    nearest, farthest = _pool(both, jnp.inf, jax.lax.min, 1).reshape(2, EDGE**2)
+    several = (range_image(rays, chosen).farthest > 0) & (-farthest > nearest)
+    count = jnp.sum(several)
+    share = jnp.sum(several & (-farthest < _SIMILAR * nearest)) / jnp.maximum(count, 1)
+    return jnp.where(count >= _LEAST_PIXELS, share, UNKNOWN).astype(jnp.float32)
 
 
 def _pool(

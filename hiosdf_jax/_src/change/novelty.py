@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.change.consistency import Compared, judge
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.rays import Rays
@@ -21,14 +22,6 @@ from hiosdf_jax._src.state import NO_FEATURE, Grid
 # A novel return is this far from every surface, beside three standard deviations of its range.
 _NOVEL_VOXELS = 1.5
 
-# The map can judge a cloud after this many updates, by at least this share of its returns.
-_CONFIDENT_UPDATES = 5
-_LEAST_COMPARABLE = 0.2
-
-# A cloud contradicts the map if more than this share of its comparable returns is novel. On
-# house_depth at most 0.4 % are in a normal frame, and 3 to 29 % in frames that are 1 m off.
-_MOST_NOVEL = 0.5
-
 
 class Novelty(NamedTuple):
     """A cloud compared with the map before it.
@@ -37,11 +30,13 @@ class Novelty(NamedTuple):
         novel: The return is in space that was free, (N,) bool.
         near_new: The return is on or next to a surface that is itself new, (N,) bool.
         consistent: The cloud agrees with the map, or the map cannot judge it, () bool.
+        noise: It does not, and it is no view of any world, () bool.
     """
 
     novel: jax.Array
     near_new: jax.Array
     consistent: jax.Array
+    noise: jax.Array
 
 
 def compare_cloud(config: Config, grid: Grid, rays: Rays, updates: jax.Array) -> Novelty:
@@ -79,8 +74,6 @@ def compare_cloud(config: Config, grid: Grid, rays: Rays, updates: jax.Array) ->
     novel = ends & empty & (free | ((passes < 0) & near_new))
 
     # New things move on: returns near them are expected, and say nothing about the whole cloud.
-    comparable = observed & ~near_new
-    count = jnp.sum(comparable)
-    contradicts = jnp.sum(novel & comparable) > _MOST_NOVEL * count
-    confident = (updates >= _CONFIDENT_UPDATES) & (count >= _LEAST_COMPARABLE * jnp.sum(rays.ends))
-    return Novelty(novel, ends & near_new, ~(confident & contradicts))
+    compared = Compared(observed & ~near_new, novel, jnp.abs(sdf))
+    verdict = judge(config, grid, rays, updates, compared)
+    return Novelty(novel, ends & near_new, verdict.consistent, verdict.noise)

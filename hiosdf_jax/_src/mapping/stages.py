@@ -286,7 +286,9 @@ def run_stages(step: Step, stages: Sequence[Stage]) -> Step:
 def is_accepted(step: Step) -> jax.Array:
     """Returns whether the checked cloud is to be fused, () bool."""
     refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE | Flag.BAD_ARGUMENT
-    patient = step.state.report.refused_in_row < step.config.most_refusals
+    most = step.config.most_refusals
+    # Noise is never believed: no world looks like that, however the sensor was carried.
+    patient = (step.state.report.refused_in_row < most) | (step.novelty.noise & (most > 0))
     return ~_has(step, refused) & ~(_has(step, Flag.INCONSISTENT_CLOUD) & patient)
 
 
