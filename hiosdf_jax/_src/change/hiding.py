@@ -12,13 +12,15 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, is_observed
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.shifts import with_neighbors
 from hiosdf_jax._src.numerics.vectors import length, split
 
 # A new thing hides free space up to this far behind its visible side, m: nothing is known of its
 # depth, and what stood there before may still stand.
 _HIDES_M = 1.5
 
-# A voxel needs this many novel returns of one cloud: one or two are stray.
+# A voxel needs this many novel returns of one cloud: one or two are stray. Next to such a voxel one
+# will do: it belongs to the same thing.
 _LEAST_NOVEL_HITS = 3
 
 # A surface counts as new for this many scans that see it.
@@ -51,7 +53,9 @@ def add_new_surfaces(
     # Next to a new surface a single one will do: it belongs to the same thing.
     count = jnp.where(novelty.near_new, _LEAST_NOVEL_HITS, 1)
     novel_hits = jnp.zeros(window.hits.size, jnp.int32).at[target].add(count, mode="drop")
-    appeared = (novel_hits >= _LEAST_NOVEL_HITS).reshape(shape)
+    novel_hits = novel_hits.reshape(shape)
+    appeared = novel_hits >= _LEAST_NOVEL_HITS
+    appeared |= (novel_hits > 0) & with_neighbors(appeared)
 
     new_hits = window.hits - before.hits
     new_passes = jnp.maximum(window.passes - jnp.abs(before.passes), 0)

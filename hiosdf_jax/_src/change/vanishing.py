@@ -14,7 +14,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.shifts import pad_axis
+from hiosdf_jax._src.numerics.shifts import with_neighbors
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
 
 # Patches that one scan can judge, and the same as a share of the window's voxels; the others are
@@ -86,7 +86,7 @@ def drop_vanished(
     change = change.astype(jnp.int8)
     window = window._replace(change=change)
     looked_at = passed | (change > 0)
-    suspects = (window.hits > 0) & ~hit & (looked_at | _is_near(change < _FORGOTTEN))
+    suspects = (window.hits > 0) & ~hit & (looked_at | with_neighbors(change < _FORGOTTEN))
     voxels = suspects.size
     # Where there are too many, each scan judges other slices of the window: none waits forever.
     most = min(_MOST_SUSPECTS, math.ceil(_SUSPECT_SHARE * voxels))
@@ -129,18 +129,6 @@ def drop_vanished(
     vanished = jax.lax.cond(many, spread, lambda vanished: vanished, vanished)
     window = window._replace(change=put(change, counted))
     return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
-
-
-def _is_near(gone: jax.Array) -> jax.Array:
-    """Returns a mask of the voxels at most one voxel away from vanished ones."""
-
-    def grow(gone: jax.Array) -> jax.Array:
-        for axis in range(3):
-            padded = pad_axis(gone, axis, 1, False)
-            gone = gone | padded.shifted(-1) | padded.shifted(1)
-        return gone
-
-    return jax.lax.cond(jnp.any(gone), grow, lambda gone: gone, gone)
 
 
 def _around(shape: tuple[int, ...], row: jax.Array) -> tuple[jax.Array, jax.Array]:

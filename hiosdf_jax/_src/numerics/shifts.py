@@ -48,3 +48,15 @@ def pad_axis(array: jax.Array, axis: int, reach: int, fill: float = 0) -> Padded
     margin = [(0, 0)] * array.ndim
     margin[axis] = (reach, reach)
     return Padded(jnp.pad(array, margin, constant_values=fill), axis, reach)
+
+
+def with_neighbors(mask: jax.Array) -> jax.Array:
+    """Returns a mask of the voxels at most one voxel away from those of a mask (X, Y, Z)."""
+
+    def grow(mask: jax.Array) -> jax.Array:
+        for axis in range(mask.ndim):
+            padded = pad_axis(mask, axis, 1, False)
+            mask = mask | padded.shifted(-1) | padded.shifted(1)
+        return mask
+
+    return jax.lax.cond(jnp.any(mask), grow, lambda mask: mask, mask)
