@@ -14,7 +14,17 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.numerics.vectors import cross, dot, each, join, length, split, take, unit
+from hiosdf_jax._src.numerics.vectors import (
+    Vector,
+    cross,
+    dot,
+    each,
+    join,
+    length,
+    split,
+    take,
+    unit,
+)
 from hiosdf_jax._src.state import NO_FEATURE, Side, Surface, frontier_step_m
 
 # A patch's weight falls by 1 / e for each of these distances that it is farther than the nearest
@@ -34,6 +44,12 @@ _OWN_SIGN_SLOPE = 1.4
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
 # patch, the height alone would be too near.
 _BEHIND_SLOPE = 1.5
+
+# The mean surface is that of patches up to the first distance, voxels, with normals up to about 45
+# degrees off. The weight falls by 1 / e for each of the second distance.
+_MOVED_VOXELS = 0.5
+_MOVED_COSINE = 0.7
+_MOVED_SOFT_VOXELS = 0.3
 
 # A voxel is either observed or not, even where its distance to the frontier is 0, m.
 _LEAST_FRONTIER = 1e-6
@@ -90,12 +106,63 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     )
 
 
+class OnSurface(NamedTuple):
+    """Points that were moved to the surface near them.
+
+    Attributes:
+        points_world: (..., 3) m.
+        normals: Unit vectors, (..., 3).
+        spread: As in `Nearest`, (...) m.
+    """
+
+    points_world: jax.Array
+    normals: jax.Array
+    spread: jax.Array
+
+
+def move_to_surface(
+    config: Config, surface: Surface, points_world: jax.Array, normals: jax.Array
+) -> OnSurface:
+    """Moves points near patches to the mean of their planes.
+
+    Only patches that are about parallel count, so that creases stay where they are.
+
+    Args:
+        config: The map's configuration.
+        surface: The grid's surface.
+        points_world: (..., 3) m, inside the bounds and near patches.
+        normals: Unit normals of the surface there, (..., 3).
+
+    Returns:
+        The points on the surface; points without such patches stay as they are.
+    """
+    corners = geometry.corners_of(config, points_world)
+    patch = _patches_at(config, surface, corners, points_world)
+    cosine = dot(patch.normal, each(lambda n: n[None], split(normals)))
+    near = patch.found & (patch.distance < _MOVED_VOXELS) & (jnp.abs(cosine) > _MOVED_COSINE)
+    nearness = jnp.exp(-patch.distance / _MOVED_SOFT_VOXELS)
+    weight = jnp.where(near, corners.weight * nearness * patch.area, 0)
+    total = jnp.sum(weight, axis=0)
+    share = weight / jnp.maximum(total, _LEAST_WEIGHT)
+    signed = share * jnp.sign(cosine)
+    height_m = jnp.sum(signed * patch.height, axis=0) * config.voxel_size
+    normal = join(unit(each(lambda n: jnp.sum(signed * n, axis=0), patch.normal)))
+    some = (total > _LEAST_WEIGHT)[..., None]
+    return OnSurface(
+        jnp.where(some, points_world - height_m[..., None] * normal, points_world),
+        jnp.where(some, normal, normals),
+        jnp.sum(share * patch.spread, axis=0) * config.voxel_size,
+    )
+
+
 class _Patches(NamedTuple):
     """The patches that the voxels around points know, relative to the points; (8, ...) voxels."""
 
     found: jax.Array  # bool
     distance: jax.Array  # 0 where none was found
     height: jax.Array  # above the plane, positive on the sensor's side
+    normal: Vector
+    area: jax.Array  # variance of the hits in the plane, voxels^2
     spread: jax.Array
 
 
@@ -117,14 +184,15 @@ def _patches_at(
     offset = patches.patch_offset(fixed, mean, (take(axes, row), take(axes, row, 3)))
     away = jnp.where(found, length(offset), 0)
     spread = length(take(axes, row, 6))
-    normal = unit(cross(take(axes, row), take(axes, row, 3)))
+    across = cross(take(axes, row), take(axes, row, 3))
+    normal = unit(across)
     # Linear in the point, with the exact value and slope: reverse mode need not go back through the
     # nearest points of eight patches.
     step = each(jnp.subtract, point, fixed)
     direction = each(lambda o: o / jnp.maximum(away, 1e-9), offset)
     distance = away + dot(direction, step)
     height = dot(each(jnp.subtract, point, mean), normal)
-    return _Patches(found, jnp.where(found, distance, 0), height, spread)
+    return _Patches(found, jnp.where(found, distance, 0), height, normal, length(across), spread)
 
 
 def _signed(patch: _Patches, side: jax.Array, own: jax.Array) -> jax.Array:

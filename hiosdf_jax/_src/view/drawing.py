@@ -17,12 +17,6 @@ from hiosdf_jax._src.view.slices import save_slices
 if TYPE_CHECKING:
     import trimesh
 
-# Number of samples that a mesh is made from, within two limits: spacing no finer than anyone can
-# see, and no coarser than the grid.
-_MESH_SAMPLES = 4e6
-_MESH_FINEST = 0.025  # m
-_SMOOTHINGS = 20  # of the mesh, for its picture
-
 _LEVEL = np.radians(10)  # floors and tables have normals within this angle of upward
 _TILTED = np.radians(2)  # a world whose z is farther than this from upward is leveled to draw it
 _MARGIN = 0.2  # m, around a leveled world
@@ -49,7 +43,7 @@ def draw_map(
     Returns:
         (3,) unit vector against gravity, refined from floors and tables; the pictures use it.
     """
-    surface = _extract(queries.field)
+    surface = mesh.extract_mesh(queries.field, 0.5 * queries.field.config.voxel_size)
     up_world = level_up(surface, up_world)
     _write_mesh(folder, surface, up_world)
     _draw_slices(folder / "slices.png", queries, exact_sdf, path_world, surface, up_world)
@@ -135,12 +129,6 @@ def _turn_to(up: np.ndarray) -> np.ndarray:
     return np.eye(3) + skew + skew @ skew / (1 + z)
 
 
-def _extract(field: Field) -> trimesh.Trimesh:
-    low, high = np.asarray(field.config.bounds)
-    spacing = max(float(np.cbrt(np.prod(high - low) / _MESH_SAMPLES)), _MESH_FINEST)
-    return mesh.extract_mesh(field, min(spacing, field.config.voxel_size))
-
-
 def _write_mesh(folder: Path, surface: trimesh.Trimesh, up_world: np.ndarray) -> None:
     model, picture = folder / "mesh.ply", folder / "mesh.png"
     if not len(surface.faces):
@@ -149,8 +137,4 @@ def _write_mesh(folder: Path, surface: trimesh.Trimesh, up_world: np.ndarray) ->
             path.unlink(missing_ok=True)
         return
     surface.export(model)
-    from trimesh.smoothing import filter_taubin
-
-    # For the picture only: between patches the surface has steps of some millimeters.
-    smooth = filter_taubin(surface.copy(), iterations=_SMOOTHINGS)
-    save_shaded(picture, smooth, up_world=up_world.tolist())
+    save_shaded(picture, surface, up_world=up_world.tolist())
