@@ -34,8 +34,12 @@ _LEAST_SCALE_VOXELS = 0.3
 _GAP_SHARE = 0.5
 
 # An unseen surface is assumed at most this much nearer than any observed one: with more, the mean
-# bound falls faster than the errors.
+# bound falls faster than the errors. Within two voxels of unseen space the assumption grows, since
+# the nearest surface may well lie in it. On half of house_depth, the bound then holds for 99.3
+# instead of 98.8 % of the points.
 _HIDDEN_VOXELS = 0.3
+_HIDDEN_BESIDE_VOXELS = 0.8
+_BESIDE_VOXELS = 2.0
 
 
 def bounds(field: Field) -> Bounds:
@@ -130,7 +134,9 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     unseen = frontier(field, points_world)
     cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen, "network"), doubt)
     # Unseen space may hide a surface that is nearer than all observed ones.
-    hidden = jnp.maximum(unseen, cautious - _HIDDEN_VOXELS * config.voxel_size)
+    beside = jnp.clip(_BESIDE_VOXELS - unseen / config.voxel_size, 0, 1)
+    nearer = (_HIDDEN_VOXELS + _HIDDEN_BESIDE_VOXELS * beside) * config.voxel_size
+    hidden = jnp.maximum(unseen, cautious - nearer)
     return jnp.minimum(cautious, hidden), scale
 
 

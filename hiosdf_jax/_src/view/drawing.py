@@ -10,7 +10,6 @@ import numpy as np
 
 from hiosdf_jax._src.field import mesh
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.state import Field
 from hiosdf_jax._src.view.shading import save_shaded
 from hiosdf_jax._src.view.slices import save_slices
 
