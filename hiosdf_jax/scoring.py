@@ -22,6 +22,11 @@ from hiosdf_jax._src.scoring.metrics import (
     held_out_surface,
 )
 from hiosdf_jax._src.scoring.scene import Scene, mesh_scene, read_scene
+from hiosdf_jax._src.scoring.surface import (
+    evaluate_held_out_mesh,
+    evaluate_mesh,
+    evaluate_steps,
+)
 from hiosdf_jax._src.scoring.table import format_bands, format_score, format_table, lay_out
 from hiosdf_jax._src.scoring.visible import StreamRays, read_rays, sample_visible, sensor_path
 
@@ -34,7 +39,10 @@ __all__ = [
     "draw_returns",
     "evaluate",
     "evaluate_bands",
+    "evaluate_held_out_mesh",
     "evaluate_lower",
+    "evaluate_mesh",
+    "evaluate_steps",
     "format_bands",
     "format_score",
     "format_table",

@@ -79,9 +79,14 @@ def measure(
                 variant["over_time"].append({"frame": frame} | scores)
             if frame == last:
                 variant["scores"] = scores
+            if frame == last and truth is None and name == "blended":
+                mesh = hio.extract_mesh(field)
+                scores |= scoring.evaluate_held_out_mesh(mesh, held_out_world)
             if frame == last and truth is not None:
                 query = _query_of(name, field)
                 variant["bands"] = scoring.evaluate_bands(query, truth, pose[:3, 3], frame)
+                if name == "blended":
+                    scores |= _score_surface(field, source)
                 if name in early:
                     first = scoring.evaluate(query, truth, last_frame=EARLY_FRAMES - 1)
                     scores["early_then_cm"] = early[name]
@@ -111,6 +116,17 @@ def _score(
     if name == "blended":
         scores |= scoring.evaluate_lower(CompiledQueries(field).lower, truth, frame)
     return scores
+
+
+def _score_surface(field: Field, source: Source) -> dict[str, float]:
+    """Scores a map's mesh and the steps of its distance."""
+    assert source.truth is not None
+    mesh, config = hio.extract_mesh(field), field.config
+    queries = CompiledQueries(field)
+    scores = scoring.evaluate_mesh(mesh, source.truth, source.distance)
+    return scores | scoring.evaluate_steps(
+        queries.sdf, queries.observed, config.bounds, mesh, config.voxel_size
+    )
 
 
 def _score_held_out(name: str, field: Field, points_world: np.ndarray) -> dict[str, float]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from hiosdf_jax import datasets, scoring
 
-# The parts of a mesh show which surface points are thin. The streams' truth does not.
+# A mesh shows which surface points are thin, and how far any point is from the surface.
 _MESHES = {"house_depth": "small_house.ply", "house_lidar": "small_house.ply"}
 
 
@@ -19,6 +22,8 @@ class Source(NamedTuple):
         stream: Its frames.
         truth: Exact distances; None for a real stream, which is scored on held-out frames.
         extent: Its bounds and range.
+        distance: Maps points (n, 3) m to their distances from the exact surface, (n,) m; None where
+            only samples of it are known.
         complete: Whether all frames of the recording are in it.
     """
 
@@ -26,6 +31,7 @@ class Source(NamedTuple):
     stream: datasets.Stream
     truth: scoring.GroundTruth | None
     extent: datasets.Extent
+    distance: Callable[[np.ndarray], np.ndarray] | None
     complete: bool
 
 
@@ -40,11 +46,13 @@ def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
     Returns:
         The stream with its truth and its bounds.
     """
+    distance: Callable[[np.ndarray], np.ndarray] | None = None
     if name == "demo":
         from hiosdf_jax import demo
 
         whole = demo.ApartmentStream()
         truth = demo.sample_truth(whole)
+        distance = _distance_in_demo(demo.load_model())
     else:
         whole = datasets.NpzStream(folder / f"{name}.npz")
         truth = datasets.read_truth(folder / f"{name}.npz")
@@ -53,18 +61,19 @@ def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
     extent = datasets.find_bounds(stream)
     complete = count == len(whole)
     if truth is not None and name in _MESHES and complete:
-        truth = _with_thin_parts(folder / _MESHES[name], stream, truth, extent.max_range)
-    return Source(name, stream, truth, extent, complete)
+        try:
+            rays = scoring.read_rays(stream, extent.max_range)
+            scene = scoring.read_scene(folder / _MESHES[name], scoring.sensor_path(rays))
+        except (FileNotFoundError, ModuleNotFoundError) as error:
+            print(f"thin parts and meshes are not scored: {error}")
+        else:
+            distance = scene.sdf_to_draw
+            drawn = scoring.sample_visible(scene, rays, count=len(stream))
+            truth = truth._replace(thin_points_world=drawn.thin_points_world)
+    return Source(name, stream, truth, extent, distance, complete)
 
 
-def _with_thin_parts(
-    mesh: Path, stream: datasets.Stream, truth: scoring.GroundTruth, max_range: float
-) -> scoring.GroundTruth:
-    try:
-        rays = scoring.read_rays(stream, max_range)
-        scene = scoring.read_scene(mesh, scoring.sensor_path(rays))
-    except (FileNotFoundError, ModuleNotFoundError) as error:
-        print(f"thin parts are not scored: {error}")
-        return truth
-    drawn = scoring.sample_visible(scene, rays, count=len(stream))
-    return truth._replace(thin_points_world=drawn.thin_points_world)
+def _distance_in_demo(model: Any) -> Callable[[np.ndarray], np.ndarray]:
+    from hiosdf_jax import demo
+
+    return lambda points_world: demo.signed_distance(model, points_world)[0]

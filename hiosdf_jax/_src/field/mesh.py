@@ -54,7 +54,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
         return trimesh.Trimesh()
     for _ in range(max(0, math.ceil(math.log2(config.voxel_size / resolution) - 1e-6))):
         both = np.concatenate([vertices, normals], axis=-1)
-        both, faces = trimesh.remesh.subdivide(both, faces)
+        both, faces = trimesh.remesh.subdivide(both, faces)[:2]
         vertices, normals = both[:, :3], both[:, 3:]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     points = ((vertices + config.corner_index) * config.voxel_size).astype(np.float32)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -101,14 +101,7 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
             (F, 3), finite, F > 0.
         ModuleNotFoundError: libigl is not installed.
     """
-    try:
-        import igl
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "distances to a mesh need libigl: in a clone, pip install '.[truth]'"
-        ) from error
-
-    vertices, faces = _corners_and_faces(mesh)
+    vertices, faces, tree = triangle_tree(mesh)
     positions = _spread_positions(sensor_path_world)
     # trimesh's own normals stay as they were when a mesh is turned inside out.
     normals = np.cross(
@@ -117,8 +110,6 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
     is_solid = bool(mesh.is_watertight and mesh.is_winding_consistent)
     part_of_face = _thin_parts(mesh)
-    tree = igl.AABB()
-    tree.init(vertices, faces)
 
     def first_triangle(origins: np.ndarray, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The first triangle on each line, -1 for none, and the share of the line up to it."""
@@ -127,6 +118,8 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
 
     def is_free(points: np.ndarray) -> np.ndarray:
         if is_solid:
+            import igl
+
             # For a mesh that is inside out, the winding number is 0 in its solid and -1 outside.
             winding = np.asarray(igl.fast_winding_number(vertices, faces, points))
             return winding < (0.5 if mesh.volume > 0 else -0.5)
@@ -165,6 +158,32 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
         return np.sqrt(tree.squared_distance(vertices, faces, np.array(points_world, float))[0])
 
     return Scene(sdf_and_grad, sdf_to_draw, cast)
+
+
+def triangle_tree(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Builds the tree that finds the triangle of a mesh nearest to a point.
+
+    Args:
+        mesh: In m.
+
+    Returns:
+        Corners (V, 3) float64, triangles (F, 3) int64, and the `igl.AABB`, which takes both.
+
+    Raises:
+        ValueError: The mesh has no triangles, or corners that are not finite.
+        ModuleNotFoundError: libigl is not installed.
+    """
+    try:
+        import igl
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "distances to a mesh need libigl: in a clone, pip install '.[truth]'"
+        ) from error
+
+    vertices, faces = _corners_and_faces(mesh)
+    tree = igl.AABB()
+    tree.init(vertices, faces)
+    return vertices, faces, tree
 
 
 def grid_scene(folder: str | os.PathLike[str]) -> Scene:
