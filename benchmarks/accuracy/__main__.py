@@ -19,6 +19,8 @@ from hiosdf_jax import Config
 _BASELINE = records.RESULTS / "accuracy_baseline.json"
 _TABLES = records.RESULTS / "accuracy.json"
 
+_BATCHES = {"batches": 8, "learning_rate": 1e-4}
+
 # {table: {row: fields of the configuration that it changes}}
 ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
     "stages": {
@@ -29,6 +31,14 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "last weights": {"weight_average": 0.0},
         "network alone": {"grid_share": 0.0},
         "grid alone": {"grid_share": 1.0},
+    },
+    # The paper's samples and epochs: with --configs paper.
+    "training": {
+        "as it is": {},
+        "8 batches": _BATCHES,
+        "Eikonal weight 0.5": {"eikonal_weight": 0.5},
+        "both": _BATCHES | {"eikonal_weight": 0.5},
+        "both, average 0.8": _BATCHES | {"eikonal_weight": 0.5, "weight_average": 0.8},
     },
     "voxel_size": {f"{edge} m": {"voxel_size": edge} for edge in (0.05, 0.1, 0.2)},
     "grid_share": {f"{share}": {"grid_share": share} for share in (0.0, 0.5, 0.8, 0.9, 1.0)},

@@ -132,7 +132,7 @@ class Config:
 
     # Training
     sdf_weight: float = _number(5.0, 0.0, 1e6)
-    eikonal_weight: float = _number(2.0, 0.0, 1e6)
+    eikonal_weight: float = _number(0.5, 0.0, 1e6)
     eikonal_every: int = _number(4, 1, 1_000)
     learning_rate: float = _number(4e-4, 0.0, 1.0)
     weight_decay: float = _number(0.012, 0.0, 1.0)
@@ -295,6 +295,7 @@ class Config:
 _PAPER: dict[str, Any] = {
     "local_points": 1_000,
     "hidden_width": 256,
+    "eikonal_weight": 2.0,
     "eikonal_every": 1,
     "grid_share": 0.0,
 }
@@ -305,7 +306,6 @@ _LIGHT: dict[str, Any] = {
     "far_samples": 24_000,
     "local_ray_samples": 10,
     "hidden_layers": 2,
-    "eikonal_weight": 0.5,
     "eikonal_every": 2,
     "learning_rate": 1e-3,
     "batches": 8,

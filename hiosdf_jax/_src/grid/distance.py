@@ -294,4 +294,4 @@ def _side(
     in_front_of_solid = (sign > 0) & in_front & ~sheet & (distance < 1)
     beside = (trusted | in_front_of_solid) & (along < _BESIDE_VOXELS)
     by_plane = jnp.where(sheet, Side.SHEET, Side.PLANE)
-    return sign, jnp.where(beside, by_plane, sign).astype(jnp.int8)
+    return sign, jnp.where(beside, by_plane, by_rays).astype(jnp.int8)
