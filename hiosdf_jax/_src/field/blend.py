@@ -93,8 +93,12 @@ def lower(field: Field, points_world: jax.Array) -> jax.Array:
         (...) m.
     """
     cautious, scale = cautious_sdf(field, points_world)
-    bound = cautious - field.optimism * scale
     unseen = frontier(field, points_world)
+    # Returns, which calibrate the optimism, say nothing about hidden surfaces: it is not lowered by
+    # this.
+    beside = jnp.clip(_BESIDE_VOXELS - unseen / field.config.voxel_size, 0, 1)
+    nearer = _HIDDEN_BESIDE_VOXELS * field.config.voxel_size * beside
+    bound = _expect_hidden(cautious, unseen, nearer) - field.optimism * scale
     return jnp.where(unseen < 0, jnp.minimum(bound, unseen), bound)
 
 
@@ -133,11 +137,12 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     doubt = lookup.doubt_distance(config, field.surface, points_world)
     unseen = frontier(field, points_world)
     cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen, "network"), doubt)
-    # Unseen space may hide a surface that is nearer than all observed ones.
-    beside = jnp.clip(_BESIDE_VOXELS - unseen / config.voxel_size, 0, 1)
-    nearer = (_HIDDEN_VOXELS + _HIDDEN_BESIDE_VOXELS * beside) * config.voxel_size
-    hidden = jnp.maximum(unseen, cautious - nearer)
-    return jnp.minimum(cautious, hidden), scale
+    return _expect_hidden(cautious, unseen, _HIDDEN_VOXELS * config.voxel_size), scale
+
+
+def _expect_hidden(cautious: jax.Array, unseen: jax.Array, nearer: jax.Array | float) -> jax.Array:
+    """Lowers a distance, since unseen space may hide a surface that is this much nearer, m."""
+    return jnp.minimum(cautious, jnp.maximum(unseen, cautious - nearer))
 
 
 def _combine(
