@@ -19,8 +19,9 @@ from benchmarks import records
 from benchmarks.accuracy import __main__ as command
 from benchmarks.accuracy import figure, gate, measure, results, sources
 from hiosdf_jax import datasets, scoring
+from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.grid.lookup import grid_sdf
-from hiosdf_jax._src.scoring import held_out
+from hiosdf_jax._src.scoring import held_out, surface
 from hiosdf_jax._src.state import surface_of
 
 FRAMES = 8
@@ -60,6 +61,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(hio.Config, "light", classmethod(light))
     monkeypatch.setattr(measure, "EARLY_FRAMES", 4)
     monkeypatch.setattr(held_out, "_FIRST", 5)
+    monkeypatch.setattr(surface, "_SEGMENTS", 20_000)
     return given
 
 
@@ -96,6 +98,12 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     )
     expected["early_then_cm"] = score(states[3], 3)["visible_cm"]
     expected["early_now_cm"] = score(state, 3)["visible_cm"]
+    found = hio.extract_mesh(state)
+    expected |= scoring.evaluate_mesh(found, truth)
+    queries = CompiledQueries(hio.snapshot(state))
+    expected |= scoring.evaluate_steps(
+        queries.sdf, queries.observed, CONFIG.bounds, found, CONFIG.voxel_size
+    )
     assert blended["scores"] == pytest.approx(expected, rel=1e-4)
     assert [entry["frame"] for entry in blended["over_time"]] == [2, 5, 7]
     first = score(states[2], 2)["visible_cm"]
@@ -103,13 +111,19 @@ def test_a_stream_from_end_to_end(tmp_path, tiny, capsys):
     assert blended["over_time"][0]["surface_cm"] is None  # NaN, which JSON does not have
     grid = record["variants"]["grid"]
     query_grid = jax.jit(grid_sdf, static_argnums=0)
-    surface = query_grid(CONFIG, surface_of(state.grid), truth.surface_points_world)
-    mean_cm = 100 * float(np.abs(surface).mean())
+    on_surface = query_grid(CONFIG, surface_of(state.grid), truth.surface_points_world)
+    mean_cm = 100 * float(np.abs(on_surface).mean())
     assert grid["scores"]["surface_cm"] == pytest.approx(mean_cm, rel=1e-4)
     assert grid["bands"]["5-20 cm"]["visible_cm"] < 3
     assert record["variants"]["network"]["scores"]["visible_cm"] > grid["scores"]["visible_cm"]
 
-    assert real["variants"]["blended"]["scores"].keys() == {"median_cm", "mean_cm", "p90_cm"}
+    assert real["variants"]["blended"]["scores"].keys() == {
+        "median_cm",
+        "mean_cm",
+        "p90_cm",
+        "mesh_median_cm",
+        "mesh_p90_cm",
+    }
     held, order = hio.init(CONFIG, jax.random.key(0)), np.random.default_rng(0)
     for frame in (0, 1, 2, 3, 4, 6, 7):
         cloud, pose = stream[frame]
@@ -270,9 +284,9 @@ def test_bad_arguments(unmapped, capsys, arguments, message):
 @pytest.mark.parametrize("table", command.ABLATIONS)
 def test_ablations_are_configurations(table):
     configs = [
-        hio.Config.light(((0, 0, 0), (1, 1, 1)), **row) for row in command.ABLATIONS[table].values()
+        hio.Config.paper(((0, 0, 0), (1, 1, 1)), **row) for row in command.ABLATIONS[table].values()
     ]
-    assert len(set(configs)) >= len(configs) - 1  # one row may be what light is anyway
+    assert len(set(configs)) >= len(configs) - 1  # one row may be what paper is anyway
 
 
 # --- the gate ---
@@ -392,9 +406,9 @@ from hiosdf_jax.scoring import GroundTruth
 from hiosdf_jax.datasets import FrameStream
 stream = FrameStream("s", 1, lambda i: (np.ones((3, 3)), np.eye(4)))
 truth = GroundTruth(*5 * [np.zeros((0, 3))])
-assert sources._with_thin_parts(Path(__main__.__file__), stream, truth, 9.0) is truth
+assert sources._with_mesh(Path(__main__.__file__), stream, truth, 9.0) == (truth, None)
 """
     root = Path(__file__).parents[1]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "thin parts are not scored: trimesh" in done.stdout
+    assert "thin parts and meshes are not scored: trimesh" in done.stdout

@@ -18,15 +18,8 @@ from room_files import (
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.command import cli
-from hiosdf_jax._src.view import drawing
 
 OUTPUTS = {"metrics.json", "slices.png", "mesh.ply", "mesh.png"}
-
-
-@pytest.fixture(autouse=True)
-def coarse_meshes(monkeypatch):
-    """Meshes from fewer samples, which take most of the time of a small run."""
-    monkeypatch.setattr(drawing, "_MESH_SAMPLES", 1e5)
 
 
 def metrics_of(folder):
@@ -93,12 +86,12 @@ def test_a_stream_without_ground_truth_in_a_tilted_world(tmp_path, capsys, monke
 def test_the_first_bad_frame_ends_the_run(tmp_path, capsys, monkeypatch):
     """The map of the frames before it is written, and the exit code is 2."""
     use_room_config(monkeypatch)
-    stream = write_points(tmp_path / "scans.npz", 5, bad=[3])
+    stream = write_points(tmp_path / "scans.npz", 14, bad=[12])
     output, saved = tmp_path / "out", tmp_path / "map.npz"
     arguments = ["map", str(stream), "--output", str(output), "--save", str(saved)]
     assert cli.main(arguments) == 2  # already while the bounds are found
     message = (
-        f"hiosdf: frame 3: {stream}: poses[3]: pose has values that are not finite, "
+        f"hiosdf: frame 12: {stream}: poses[12]: pose has values that are not finite, "
         "expected T_world_sensor: "
     )
     last = capsys.readouterr().err.splitlines()[-1]
@@ -108,11 +101,11 @@ def test_the_first_bad_frame_ends_the_run(tmp_path, capsys, monkeypatch):
     assert cli.main([*arguments, *BOX]) == 2
     text = capsys.readouterr()
     assert text.err.splitlines()[-1] == last
-    assert "ended early by frame 3: " in text.out
+    assert "ended early by frame 12: " in text.out
     check_pictures(output)
     metrics = metrics_of(output)
-    assert (metrics["updates"], metrics["frames_skipped"]) == (3, 0)
-    assert metrics["stopped_by"].startswith("frame 3: ")
+    assert (metrics["updates"], metrics["frames_skipped"]) == (12, 0)
+    assert metrics["stopped_by"].startswith("frame 12: ")
     assert int(hio.load(saved).updates) == 3
 
 

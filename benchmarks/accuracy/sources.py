@@ -22,17 +22,17 @@ class Source(NamedTuple):
         stream: Its frames.
         truth: Exact distances; None for a real stream, which is scored on held-out frames.
         extent: Its bounds and range.
+        complete: Whether all frames of the recording are in it.
         distance: Maps points (n, 3) m to their distances from the exact surface, (n,) m; None where
             only samples of it are known.
-        complete: Whether all frames of the recording are in it.
     """
 
     name: str
     stream: datasets.Stream
     truth: scoring.GroundTruth | None
     extent: datasets.Extent
-    distance: Callable[[np.ndarray], np.ndarray] | None
     complete: bool
+    distance: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
@@ -61,16 +61,22 @@ def open_source(folder: Path, name: str, frames: int | None = None) -> Source:
     extent = datasets.find_bounds(stream)
     complete = count == len(whole)
     if truth is not None and name in _MESHES and complete:
-        try:
-            rays = scoring.read_rays(stream, extent.max_range)
-            scene = scoring.read_scene(folder / _MESHES[name], scoring.sensor_path(rays))
-        except (FileNotFoundError, ModuleNotFoundError) as error:
-            print(f"thin parts and meshes are not scored: {error}")
-        else:
-            distance = scene.sdf_to_draw
-            drawn = scoring.sample_visible(scene, rays, count=len(stream))
-            truth = truth._replace(thin_points_world=drawn.thin_points_world)
-    return Source(name, stream, truth, extent, distance, complete)
+        truth, distance = _with_mesh(folder / _MESHES[name], stream, truth, extent.max_range)
+    return Source(name, stream, truth, extent, complete, distance)
+
+
+def _with_mesh(
+    mesh: Path, stream: datasets.Stream, truth: scoring.GroundTruth, max_range: float
+) -> tuple[scoring.GroundTruth, Callable[[np.ndarray], np.ndarray] | None]:
+    """Adds points on thin parts to a truth, and returns the distance from the mesh."""
+    try:
+        rays = scoring.read_rays(stream, max_range)
+        scene = scoring.read_scene(mesh, scoring.sensor_path(rays))
+    except (FileNotFoundError, ModuleNotFoundError) as error:
+        print(f"thin parts and meshes are not scored: {error}")
+        return truth, None
+    drawn = scoring.sample_visible(scene, rays, count=len(stream))
+    return truth._replace(thin_points_world=drawn.thin_points_world), scene.sdf_to_draw
 
 
 def _distance_in_demo(model: Any) -> Callable[[np.ndarray], np.ndarray]:
