@@ -106,7 +106,7 @@ def test_the_first_bad_frame_ends_the_run(tmp_path, capsys, monkeypatch):
     metrics = metrics_of(output)
     assert (metrics["updates"], metrics["frames_skipped"]) == (12, 0)
     assert metrics["stopped_by"].startswith("frame 12: ")
-    assert int(hio.load(saved).updates) == 3
+    assert int(hio.load(saved).updates) == 12
 
 
 def test_the_demo(tmp_path, capsys):

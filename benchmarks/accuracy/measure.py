@@ -49,7 +49,7 @@ def measure(
     )
     count, truth = len(source.stream), source.truth
     held_out = scoring.held_out_frames(count) if truth is None else range(0)
-    held_out_world = _returns_of(source.stream, held_out, config)
+    held_out_world = draw_held_out(source.stream, config) if held_out else np.empty((0, 3))
     mapped = [frame for frame in range(count) if frame not in held_out]
     last = mapped[-1]
     state = hio.init(config, jax.random.key(seed))
@@ -138,9 +138,9 @@ def _score_held_out(name: str, field: Field, points_world: np.ndarray) -> dict[s
     return {key: value for key, value in scores.items() if key in scoring.METRICS}
 
 
-def _returns_of(stream: datasets.Stream, frames: range, config: hio.Config) -> np.ndarray:
+def draw_held_out(stream: datasets.Stream, config: hio.Config) -> np.ndarray:
     """Draws returns of the held-out frames, (n, 3) m, world frame."""
-    rng = np.random.default_rng(_HELD_OUT_SEED)
+    rng, frames = np.random.default_rng(_HELD_OUT_SEED), scoring.held_out_frames(len(stream))
     parts = [np.empty((0, 3), np.float32)]
     for frame in frames:
         cloud, pose = datasets.read_frame(stream, frame)
