@@ -84,11 +84,11 @@ def test_steps(monkeypatch):
 
     scores = evaluate_steps(sdf, observed, bounds, PLATE, 0.1)
     # A segment of 2.5 mm has 1.25 mm along x on average.
-    assert scores["step_share"] == pytest.approx(1.25e-3, rel=0.15)
+    assert scores["steps_ppm"] == pytest.approx(1250, rel=0.15)
     assert 3 < scores["step_largest_cm"] < 3.26
-    assert scores["sign_far"] == 0
+    assert scores["far_flips_ppm"] == 0
     # The same with the sign change 10 cm above the plate, with voxels of 10 cm.
     scores = evaluate_steps(lambda points: sdf(points) - 0.1, observed, bounds, PLATE, 0.1)
-    assert scores["sign_far"] > 1e6 * 1.25e-3
+    assert scores["far_flips_ppm"] > 1e6 * 1.25e-3
     scores = evaluate_steps(lambda points: sdf(points) - 0.1, observed, bounds, PLATE, 0.3)
-    assert scores["sign_far"] == 0
+    assert scores["far_flips_ppm"] == 0

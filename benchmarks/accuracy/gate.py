@@ -2,7 +2,7 @@
 
 A figure is worse if its mean over the seeds has moved the wrong way by more than the largest of:
 three standard errors of the difference, from the spread between the seeds on both sides; 5 % of the
-baseline; 0.02 cm, or 0.002 for a figure without a unit.
+baseline; 0.02 cm, 20 ppm, or 0.002 for a figure without a unit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hiosdf_jax.scoring import METRICS, format_score
 
 _ERRORS = 3.0
 _SHARE = 0.05
-_FLOORS = {"cm": 0.02, "-": 0.002}
+_FLOORS = {"cm": 0.02, "ppm": 20.0, "-": 0.002}
 
 # {stream: {configuration: what `describe` gives and "figures": {variant: figures}}}
 Baseline = dict[str, dict[str, dict[str, Any]]]

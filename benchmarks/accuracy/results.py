@@ -15,7 +15,12 @@ from hiosdf_jax.scoring import METRICS, format_score, lay_out
 _PEERS = Path(__file__).with_name("peers.json")
 
 # What the tables of the documents show.
-_TABLE_METRICS = ("visible_cm", "recall", "fpr", "thin_share", "median_cm", "p90_cm")
+_TABLE_METRICS = (
+    *("visible_cm", "recall", "fpr", "thin_share", "median_cm", "p90_cm", "cosine", "eikonal"),
+    *("mesh_accuracy_cm", "mesh_completeness_cm", "mesh_f_1cm", "mesh_f_2cm", "mesh_f_5cm"),
+    *("mesh_sdf_cm", "mesh_thin_share", "mesh_median_cm", "mesh_p90_cm"),
+    *("steps_ppm", "step_largest_cm", "far_flips_ppm"),
+)
 
 Figures = dict[str, list[float]]  # {metric, or "metric band": one value per seed}
 

@@ -13,6 +13,7 @@ from hiosdf_jax.scoring import format_score
 _HOUSE = {"house_depth": "depth camera", "house_lidar": "LiDAR"}
 _REAL = {"kitchen_depth": "kitchen", "hall_lidar": "hall"}
 _PRESETS = ("default", "paper", "light")
+_MESHES = ("default", "light")
 
 _PEERS = {
     "Voxfield 10 cm": "Voxfield, 10 cm",
@@ -101,12 +102,56 @@ def slopes() -> str:
     return lay_out(["Eikonal loss on", *columns], rows)
 
 
+def mesh() -> str:
+    """The mesh of the house, ours beside Open3D's."""
+    names = [f"Open3D TSDF {edge} cm" for edge in (10, 5, 2)]
+    figures = {f"{name[:11]}, {name[12:]} voxels": _peer("house_depth", name) for name in names}
+    figures |= {f"`Config.{c}`, 10 cm voxels": _blended("house_depth", c) for c in _MESHES}
+    metrics = ("mesh_accuracy_cm", "mesh_completeness_cm", "mesh_sdf_cm")
+    rows = []
+    for label, scores in figures.items():
+        shares = [_score(scores, f"mesh_f_{tolerance}cm") for tolerance in (1, 2, 5)]
+        rows.append([label, *(_score(scores, metric) for metric in metrics), " / ".join(shares)])
+        rows[-1].append(_score(scores, "mesh_thin_share"))
+    columns = ["accuracy, cm", "completeness, cm", "distance to the mesh, cm"]
+    columns += ["F-score at 1 / 2 / 5 cm", "thin parts"]
+    return lay_out(["house, depth camera", *columns], rows)
+
+
+def steps() -> str:
+    """How the distance changes along 2.5 mm, and gradients."""
+    metrics = ("steps_ppm", "step_largest_cm", "far_flips_ppm", "cosine", "eikonal")
+    rows = [
+        [f"`Config.{config}`", *(_score(_blended("house_depth", config), m) for m in metrics)]
+        for config in ("default", "light", "paper")
+    ]
+    columns = ["changes > 5 mm", "largest, cm", "sign changes far from surfaces, of a million"]
+    columns += ["1 - cos of the gradient", "abs(norm - 1)"]
+    return lay_out(["house, depth camera", *columns], rows)
+
+
+def training() -> str:
+    """The paper's network alone, with the paper's samples and epochs."""
+    rows = []
+    for label, entry in records.read(_RECORD)["house_depth"].items():
+        config, _, change = label.partition(", ")
+        if config == "paper" and change and "=" not in change:
+            mean, half = entry["mean"]["network"], entry["half_range"]["network"]
+            error = f"{_score(mean, 'visible_cm')} ± {_score(half, 'visible_cm')}"
+            rows.append([change, error, *(_score(mean, m) for m in ("cosine", "eikonal"))])
+    columns = ["error, cm", "1 - cos of the gradient", "abs(norm - 1)"]
+    return lay_out(["`Config.paper`, house, depth camera", *columns], rows)
+
+
 TABLES = {
     "accuracy": house,
     "accuracy-spread": spread,
     "real": real,
     "ablation": ablation,
     "slopes": slopes,
+    "mesh": mesh,
+    "steps": steps,
+    "training": training,
 }
 
 _RECORD = records.RESULTS / "accuracy.json"
@@ -114,6 +159,14 @@ _RECORD = records.RESULTS / "accuracy.json"
 
 def _figures(stream: str, config: str) -> dict[str, Any]:
     return records.read(_RECORD)[stream].get(config, {})
+
+
+def _blended(stream: str, config: str) -> Figures:
+    return _figures(stream, config)["mean"]["blended"]
+
+
+def _peer(stream: str, name: str) -> Figures:
+    return {metric: values[0] for metric, values in load_peers()[stream][name].items()}
 
 
 def _checks(*streams: Figures) -> list[str]:

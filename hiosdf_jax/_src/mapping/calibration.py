@@ -24,8 +24,9 @@ _LEAST_RETURNS = 100  # needed for a quantile
 _MEMORY = 0.98  # share of the old value in the average over updates
 _INITIAL = 3.0
 
-# Free space needs at least this much even where returns agree with the map: on the demo, whose
-# returns alone give 0.45, the bound holds for 98.6 % of the points with 0.52 and for 99.0 % with this.
+# Free space needs at least this much even where returns agree with the map. On the demo, whose
+# returns alone give 0.45, the bound holds for 98.6 % of the points with 0.52, and for 99.0 % with
+# this.
 _LEAST = 0.65
 
 

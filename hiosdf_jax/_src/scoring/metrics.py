@@ -34,7 +34,7 @@ class Metric(NamedTuple):
 
     Attributes:
         label: In words.
-        unit: "cm", or "-" for none.
+        unit: "cm", "ppm", or "-" for none.
         better: "lower", "higher" or "nearer 0".
     """
 
@@ -69,9 +69,9 @@ _METRICS = {
     "mesh_thin_share": ("thin parts within 2 cm of the mesh", "-", "higher"),
     "mesh_median_cm": ("held-out returns to the mesh, median", "cm", "lower"),
     "mesh_p90_cm": ("held-out returns to the mesh, 90 % below", "cm", "lower"),
-    "step_share": ("changes > 5 mm along 2.5 mm", "-", "lower"),
+    "steps_ppm": ("changes > 5 mm along 2.5 mm", "ppm", "lower"),
     "step_largest_cm": ("largest change along 2.5 mm", "cm", "lower"),
-    "sign_far": ("sign changes far from the mesh, of a million", "-", "lower"),
+    "far_flips_ppm": ("sign changes far from the mesh", "ppm", "lower"),
     "early_then_cm": ("error where the first frames saw, after them", "cm", "lower"),
     "early_now_cm": ("error where the first frames saw, at the end", "cm", "lower"),
 }

@@ -108,10 +108,10 @@ def evaluate_steps(
         voxel_size: Edge of the map's voxels, m.
 
     Returns:
-        `step_share`: share of the segments along which the distance changes by more than 5 mm.
+        `steps_ppm`: segments along which the distance changes by more than 5 mm, per million.
         `step_largest_cm`: the largest change.
-        `sign_far`: number of segments along which the sign changes although the mesh is farther
-            than half a voxel, per million segments.
+        `far_flips_ppm`: segments along which the sign changes although the mesh is farther than
+            half a voxel, per million.
 
     Raises:
         ModuleNotFoundError: libigl is not installed.
@@ -129,9 +129,9 @@ def evaluate_steps(
     flips = start[(first < 0) != (last < 0)]
     far = np.sum(_distance_to(mesh)(flips) > 0.5 * voxel_size + _SEGMENT)
     return {
-        "step_share": float(np.mean(step > _STEP)),
+        "steps_ppm": 1e6 * float(np.mean(step > _STEP)),
         "step_largest_cm": 100 * float(np.max(step)),
-        "sign_far": 1e6 * float(far) / len(start),
+        "far_flips_ppm": 1e6 * float(far) / len(start),
     }
 
 

@@ -49,11 +49,13 @@ def format_score(key: str, value: Any) -> str:
         value: The score, a sequence of scores to average, or None.
 
     Returns:
-        Two decimals for centimeters, three for anything else; a dash for no value or NaN.
+        Two decimals for centimeters, none for parts per million, three for anything else; a dash
+        for no value or NaN.
     """
     if value is None or not np.isfinite(np.mean(value)):
         return "-"
-    return f"{np.mean(value):.{2 if METRICS[key].unit == 'cm' else 3}f}"
+    decimals = {"cm": 2, "ppm": 0}.get(METRICS[key].unit, 3)
+    return f"{np.mean(value):.{decimals}f}"
 
 
 def lay_out(cells: Sequence[Sequence[str]], text_columns: int) -> str:
