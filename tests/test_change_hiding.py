@@ -224,3 +224,26 @@ def test_returns_in_hidden_space_are_newer_evidence_than_old_passes():
     assert renew(1, passes=-40.0, novel=False) == (1, 0, 0, False)
     assert renew(1, passes=-40.0, hits=6.0, novel=False) == (7, 40, 0, False)  # an old surface
     assert renew(0, passes=-40.0) == (0, -40, 0, False)
+
+
+@pytest.mark.parametrize(
+    ("offset", "new"), [((0, 0, 0.1), True), ((-0.1, 0.1, 0), True), ((0, 0.2, 0), False)]
+)
+def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset, new):
+    middle = np.array([0.35, 0.55, 0.65])
+    ends = np.concatenate([middle + np.zeros((3, 3)), middle[None] + offset])
+    rays = rays_of(ends)
+    start = empty_window()
+    start = start._replace(passes=jnp.full_like(start.passes, 40.0))
+    ended = np.asarray(rays.in_range)
+    found = Novelty(
+        novel=jnp.asarray(ended),
+        near_new=jnp.zeros(ROWS, bool),
+        consistent=jnp.asarray(True),
+        noise=jnp.asarray(False),
+    )
+    result, fresh = add_new(CONFIG, start, fuse_hits(CONFIG, start, rays), rays, found)
+    other = tuple(np.add(CELL, np.round(np.array(offset) / 0.1).astype(int)))
+    assert float(result.passes[CELL]) == 0
+    assert float(result.passes[other]) == (0 if new else 40)
+    assert np.asarray(fresh).sum() == (4 if new else 3)
