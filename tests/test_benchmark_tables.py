@@ -131,7 +131,7 @@ def test_provenance_is_that_of_this_process(tmp_path, monkeypatch):
 
 def test_updating_the_tables_keeps_other_entries(tmp_path):
     def runs(*values):
-        scores = [{"visible_cm": value, "eikonal": 0.1} for value in values]
+        scores = [{"visible_cm": value, "bias_cm": 0.1} for value in values]
         head = {"frames": 20, "device": "cpu", "jax": "0", "revision": "abc1234"}
         return [
             head | {"seed": seed, "variants": {"grid": {"scores": one, "bands": {}}}}
