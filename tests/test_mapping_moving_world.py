@@ -196,7 +196,7 @@ def test_the_configuration_says_how_many_clouds_are_refused(sharp_map, most, ref
     assert int(flags) == hio.Flag.INCONSISTENT_CLOUD
 
 
-def test_noise_is_never_believed(sharp_map):
+def test_random_points_are_always_refused(sharp_map):
     """A cloud that is no view of any world stays refused, however many came before it."""
     cloud, pose = contradiction()
     for most, refused, noise, accepted in (

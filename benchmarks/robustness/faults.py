@@ -121,14 +121,14 @@ def faults(setup: Setup, folder: Path) -> Rows:
 
 def _millimeters_from_the_start(setup: Setup, stream: Stream, clean: Clean) -> Rows:
     label = "millimeters from the start"
-    played = _play(setup, stream, None, _in_millimeters(stream.frames[:10]), label)
+    played = _play(setup, stream, None, _scaled(stream.frames[:10], 1000), label)
     return {f"{stream.name}: {label}": {"flagged_first": _alarm(clean, played, 1)["flagged"]}}
 
 
 def _out_of_range(setup: Setup, stream: Stream, clean: Clean) -> Rows:
     """The whole stream, and then all of it again, so scaled that no return is in range."""
     label = "then all beyond max_range"
-    played = _play(setup, stream, clean.whole, _in_millimeters(stream.frames), label)
+    played = _play(setup, stream, clean.whole, _scaled(stream.frames, 1000), label)
     return {f"{stream.name}: {label}": _score(stream, clean, played.state) | _alarm(clean, played)}
 
 
@@ -173,9 +173,9 @@ def _far_pose(stream: Stream, rng: np.random.Generator) -> list[Frame]:
 BURSTS: dict[str, Callable[[Stream, np.random.Generator], list[Frame]]] = {
     "10 random clouds": lambda stream, rng: _random_clouds(stream, rng, 10),
     "30 random clouds": lambda stream, rng: _random_clouds(stream, rng, 30),
-    "10 clouds in millimeters": lambda stream, _: _scaled(stream, 1000),
-    "10 clouds 1.3 times as long": lambda stream, _: _scaled(stream, 1.3),
-    "10 clouds in feet": lambda stream, _: _scaled(stream, _FEET),
+    "10 clouds in millimeters": lambda stream, _: _scaled(_late(stream), 1000),
+    "10 clouds 1.3 times as long": lambda stream, _: _scaled(_late(stream), 1.3),
+    "10 clouds in feet": lambda stream, _: _scaled(_late(stream), _FEET),
     "5 frames 1 m off": _displaced,
     "lens covered for 5 frames": _covered,
     "a pose 1e20 m away": _far_pose,
@@ -234,13 +234,12 @@ STEADY: dict[str, tuple[Spoil, Callable[[int], Any]]] = {
 }
 
 
-def _scaled(stream: Stream, factor: float) -> list[Frame]:
-    frames = stream.frames[_BURST_AFTER - 10 : _BURST_AFTER]
+def _late(stream: Stream) -> Sequence[Frame]:
+    return stream.frames[_BURST_AFTER - 10 : _BURST_AFTER]
+
+
+def _scaled(frames: Sequence[Frame], factor: float) -> list[Frame]:
     return [frame._replace(cloud=(factor * frame.cloud).astype(np.float32)) for frame in frames]
-
-
-def _in_millimeters(frames: Sequence[Frame]) -> list[Frame]:
-    return [frame._replace(cloud=1000 * frame.cloud) for frame in frames]
 
 
 def _directions(cloud: np.ndarray) -> np.ndarray:

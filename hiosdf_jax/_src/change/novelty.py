@@ -14,10 +14,10 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.change.consistency import Compared, judge
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.vectors import each, split, take
-from hiosdf_jax._src.state import NO_FEATURE, Grid
+from hiosdf_jax._src.numerics.vectors import split
+from hiosdf_jax._src.state import Grid
 
 # A novel return is this far from every surface, beside three standard deviations of its range.
 _NOVEL_VOXELS = 1.5
@@ -58,9 +58,7 @@ def compare_cloud(config: Config, grid: Grid, rays: Rays, updates: jax.Array) ->
     voxel = geometry.flat_index(shape, index)
     ends = rays.ends & rays.inside
 
-    jump = take(derived.nearest.reshape(-1, 3), voxel)
-    found = jump[0] != NO_FEATURE
-    patch = geometry.flat_index(shape, each(lambda i, j: jnp.where(found, i + j, i), index, jump))
+    patch = lookup.patch_voxel(config, derived, index)
     change = evidence.change.ravel()
     near_new = (change[voxel] > 0) | (change[patch] > 0)
 

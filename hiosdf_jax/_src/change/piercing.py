@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.vectors import each, split, take
-from hiosdf_jax._src.state import NO_FEATURE, Grid
+from hiosdf_jax._src.numerics.vectors import split
+from hiosdf_jax._src.state import Grid
 
 # A ray has pierced a surface where a voxel's center is this far behind it. Its end may lie this far
 # behind the surface, beside three standard deviations of its range.
@@ -17,7 +17,8 @@ _BEHIND_VOXELS = 0.5
 _TOLERANCE_VOXELS = 1.5
 
 # Rays step by the distance that the map has stored, and half a voxel at least. Near walls that are
-# not met head-on the steps are short. Rays that have not arrived after so many pierce nothing.
+# not met head-on the steps are short. Rays that have not
+# arrived after this number of steps pierce nothing.
 _STEPS = 48
 
 
@@ -51,10 +52,7 @@ def find_piercing(config: Config, grid: Grid, rays: Rays) -> jax.Array:
     count = rays.in_range.shape[0]
     start = jnp.full(count, config.min_range, jnp.float32)
     _, met = jax.lax.fori_loop(0, _STEPS, advance, (start, jnp.full(count, -1, jnp.int32)))
-    voxel = jnp.maximum(met, 0)
-    index = jnp.unravel_index(voxel, shape)
-    jump = take(derived.nearest.reshape(-1, 3), voxel)
-    found = jump[0] != NO_FEATURE
-    patch = geometry.flat_index(shape, each(lambda i, j: jnp.where(found, i + j, i), index, jump))
+    x, y, z = jnp.unravel_index(jnp.maximum(met, 0), shape)
+    patch = lookup.patch_voxel(config, derived, (x, y, z))
     new = grid.evidence.change.ravel()[patch] > 0
     return rays.in_range & (met >= 0) & ~new

@@ -34,7 +34,7 @@ _LEAST_SCALE_VOXELS = 0.3
 _GAP_SHARE = 0.5
 
 # An unseen surface is assumed at most this much nearer than any observed one: with more, the mean
-# bound falls faster than the errors. Within two voxels of unseen space the assumption grows, since
+# bound falls faster than the errors. Within 2.5 voxels of unseen space the assumption grows, since
 # the nearest surface may well lie in it. On half of house_depth, the bound then holds for 99.4
 # instead of 98.8 % of the points.
 _HIDDEN_VOXELS = 0.3

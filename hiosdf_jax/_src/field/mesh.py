@@ -56,9 +56,8 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
         both = np.concatenate([vertices, normals], axis=-1)
         both, faces = trimesh.remesh.subdivide(both, faces)[:2]
         vertices, normals = both[:, :3], both[:, 3:]
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     points = ((vertices + config.corner_index) * config.voxel_size).astype(np.float32)
-    normals = normals.astype(np.float32)
+    normals = polygons.unit(normals).astype(np.float32)
     moved, turned = np.empty_like(points), np.empty_like(normals)
     spread = np.empty(len(points), np.float32)
 

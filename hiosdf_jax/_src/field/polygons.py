@@ -21,8 +21,8 @@ _EXTENT_DEVIATIONS = 1.5
 _LEAST_WIDTH = 3e-3
 
 # A neighbor continues a surface where its plane passes this near, voxels: more leaves fewer holes
-# around small things, and draws more that is not there. The surface must also head for it: so much
-# of a step in its direction must lie in the plane.
+# around small things, and draws more that is not there. The surface must also head for it: at
+# least this share of a step in its direction must lie in the plane.
 _CONTINUES_VOXELS = 0.35
 _HEADS_FOR = 0.45
 
@@ -94,12 +94,12 @@ def find_patches(surface: Surface) -> Patches:
     used &= np.linalg.norm(axes[..., 1, :].astype(np.float32), axis=-1) > _LEAST_WIDTH
     index = np.argwhere(used)
     mean, axes = (array[used].astype(float) for array in (mean, axes))
-    normal = _unit(np.cross(axes[:, 0], axes[:, 1]))
+    normal = unit(np.cross(axes[:, 0], axes[:, 1]))
     row = np.full(used.shape, -1)
     row[used] = np.arange(len(index))
 
     # The faces of the voxel, and the borders of the surface, which may cross them.
-    middle = _unit(axes[:, 1])
+    middle = unit(axes[:, 1])
     direction = [np.broadcast_to(side, normal.shape) for side in (*np.eye(3), *-np.eye(3))]
     direction = np.stack([*direction, middle, -middle])
     end = np.sum(0.5 * np.abs(direction) - mean * direction, axis=-1)
@@ -108,14 +108,15 @@ def find_patches(surface: Surface) -> Patches:
     )
     limit = np.minimum(reach, end)
     for k, side in enumerate(direction):
-        goes_on = _continues(row, index, mean, normal, side)
-        # Across its plane a polygon would be cut by its slope.
-        goes_on |= np.argmax(np.abs(normal), axis=-1) == (k % 3 if k < 6 else -1)
-        limit[k] = np.where(goes_on, end[k], limit[k])
+        limit[k] = np.where(_continues(row, index, mean, normal, side), end[k], limit[k])
+    # Across its plane a polygon would be cut by its slope.
+    each, steepest = np.arange(len(index)), np.argmax(np.abs(normal), axis=-1)
+    for face in (steepest, steepest + 3):
+        limit[face, each] = end[face, each]
     return Patches(index + 0.5 + mean, normal, direction, limit)
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
     """Scales vectors (..., 3) to length 1."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
@@ -156,7 +157,7 @@ def _continues(
 def cut_polygons(patches: Patches) -> Polygons:
     """Cuts the patches' planes in all their directions."""
     normal = patches.normal
-    first = _unit(np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=-1)]))
+    first = unit(np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=-1)]))
     second = np.cross(normal, first)
     # Larger than any cut of a voxel by a plane.
     square = [a * first + b * second for a, b in ((-2, -2), (2, -2), (2, 2), (-2, 2))]
@@ -218,7 +219,7 @@ def join_corners(polygons: Polygons, normal: np.ndarray) -> Triangles:
     _, some = np.unique(vertex_of, return_index=True)
     sign = np.where(np.sum(normal * normal[some][vertex_of], axis=-1) < 0, -1.0, 1.0)
     total = _sum_of_rows(sign[:, None] * normal, vertex_of, len(vertex))
-    total = _unit(total)
+    total = unit(total)
 
     # A fan around the first corner of each polygon.
     start = np.repeat(np.cumsum(count) - count, count)

@@ -25,7 +25,7 @@ from hiosdf_jax._src.numerics.vectors import (
     take,
     unit,
 )
-from hiosdf_jax._src.state import NO_FEATURE, Side, Surface, frontier_step_m
+from hiosdf_jax._src.state import NO_FEATURE, Derived, Side, Surface, frontier_step_m
 
 # A patch's weight falls by 1 / e for each of these distances that it is farther than the nearest
 # one, voxels. Twice as much rounds off corners: 0.25 instead of 0.18 cm in a small room. Half as
@@ -223,6 +223,23 @@ def grid_sdf(config: Config, surface: Surface, points_world: jax.Array) -> jax.A
         (...) m; the horizon where no patch is within it. Differentiable by the points.
     """
     return nearest_patch(config, surface, points_world).sdf
+
+
+def patch_voxel(config: Config, derived: Derived, index: Vector) -> jax.Array:
+    """Finds the voxels whose patches are nearest to voxels.
+
+    Args:
+        config: The map's configuration.
+        derived: The grid's distances.
+        index: Voxel indices, (...) int32 each.
+
+    Returns:
+        Indices into the raveled grid, (...) int32; a voxel's own where it knows no patch.
+    """
+    shape = config.grid_shape
+    jump = take(derived.nearest.reshape(-1, 3), geometry.flat_index(shape, index))
+    found = jump[0] != NO_FEATURE
+    return geometry.flat_index(shape, each(lambda i, j: jnp.where(found, i + j, i), index, jump))
 
 
 def doubt_distance(config: Config, surface: Surface, points_world: jax.Array) -> jax.Array:

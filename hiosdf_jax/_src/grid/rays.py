@@ -11,8 +11,8 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.numerics.vectors import length, split
 
-# Returns this near to the robot's spheres are on the robot, because noise moves them: within so
-# many m, or so many standard deviations of their range if that is more.
+# Noise moves returns off the robot. They count as on it up to this distance from its spheres, m, or
+# this multiple of the standard deviation of their range, whichever is larger.
 _ROBOT_MARGIN_M = 0.03
 _ROBOT_MARGIN_SIGMAS = 3.0
 

@@ -287,7 +287,7 @@ def is_accepted(step: Step) -> jax.Array:
     """Returns whether the checked cloud is to be fused, () bool."""
     refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE | Flag.BAD_ARGUMENT
     most = step.config.most_refusals
-    # Noise is never believed: no world looks like that, however the sensor was carried.
+    # Random points are refused however often they come: no pose explains them.
     patient = (step.state.report.refused_in_row < most) | (step.novelty.noise & (most > 0))
     return ~_has(step, refused) & ~(_has(step, Flag.INCONSISTENT_CLOUD) & patient)
 

@@ -20,7 +20,7 @@ _CHUNK = 8192
 _NEAR = 0.5  # m, "near" in near_cm and near_bias_cm
 _LOCAL_RADIUS = 3.0  # m, the paper's local SDF error
 _RADIUS_BOUNDS = (0.05, 0.4)  # m, robot spheres from a gripper finger to a mobile base
-_KEPT = 0.02  # m, a thin part is lost where the sdf on it exceeds this
+KEPT = 0.02  # m, a thin part is lost where the sdf on it exceeds this
 _BANDS = {  # true distance, m: from (inclusive), to (exclusive)
     "0-5 cm": (0.0, 0.05),
     "5-20 cm": (0.05, 0.2),
@@ -150,11 +150,11 @@ def evaluate(
         "surface_cm": np.nan,  # surface points carry no frame
     }
     if answers.complete:
-        surface = _in_chunks(lambda p: sdf_and_grad(p)[0], truth.surface_points_world)
+        surface = in_chunks(lambda p: sdf_and_grad(p)[0], truth.surface_points_world)
         scores["surface_cm"] = 100 * _mean(np.abs(surface))
     if answers.complete and len(truth.thin_points_world):
-        thin = _in_chunks(lambda p: sdf_and_grad(p)[0], truth.thin_points_world)
-        scores["thin_share"] = _mean(np.where(np.isnan(thin), np.nan, thin <= _KEPT))
+        thin = in_chunks(lambda p: sdf_and_grad(p)[0], truth.thin_points_world)
+        scores["thin_share"] = _mean(np.where(np.isnan(thin), np.nan, thin <= KEPT))
     return {key: scores[key] for key in METRICS if key in scores}
 
 
@@ -204,7 +204,7 @@ def evaluate_lower(
         `lower_slack_cm`: mean of true distance - bound.
     """
     selected = np.full(len(truth.sdf), True) if last_frame is None else truth.frame <= last_frame
-    slack = truth.sdf[selected].astype(float) - _in_chunks(lower, truth.points_world[selected])
+    slack = truth.sdf[selected].astype(float) - in_chunks(lower, truth.points_world[selected])
     return {"lower_coverage": _mean(slack >= 0), "lower_slack_cm": 100 * _mean(slack)}
 
 
@@ -230,7 +230,7 @@ def held_out_surface(
     points = np.asarray(points_world)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise ValueError(f"points_world has shape {points.shape}, expected (N, 3) with N > 0")
-    error_cm = 100 * np.abs(_in_chunks(sdf, points))
+    error_cm = 100 * np.abs(in_chunks(sdf, points))
     return {
         "median_cm": float(np.median(error_cm)),
         "mean_cm": _mean(error_cm),
@@ -305,9 +305,11 @@ def _paper_metrics(
     return scores
 
 
-def _in_chunks(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
-    """Evaluates a function of points, (N, 3) -> (N,) float64, in chunks of one shape."""
-    values = np.empty(len(points))
+def in_chunks(
+    function: Callable[[np.ndarray], Any], points: np.ndarray, kind: type = float
+) -> np.ndarray:
+    """Evaluates a function of points, (N, 3) -> (N,) of a kind, in chunks of one shape."""
+    values = np.empty(len(points), kind)
     fill_in_chunks(
         lambda rows: (function(points[rows].astype(np.float32)),),
         {"sdf of the map": values},

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hiosdf_jax._src.datasets.truth import GroundTruth
-from hiosdf_jax._src.numerics.chunks import fill_in_chunks
+from hiosdf_jax._src.scoring.metrics import KEPT, in_chunks
 from hiosdf_jax._src.scoring.scene import triangle_tree
 
 if TYPE_CHECKING:
@@ -16,12 +16,10 @@ if TYPE_CHECKING:
 
 _SAMPLES = 200_000  # points on the mesh
 _F_TOLERANCES = {"mesh_f_1cm": 0.01, "mesh_f_2cm": 0.02, "mesh_f_5cm": 0.05}  # m
-_KEPT = 0.02  # m, as for `thin_share`
 
 _SEGMENTS = 1_000_000
 _SEGMENT = 0.0025  # m
 _STEP = 0.005  # m, twice what a distance can change along a segment
-_CHUNK = 8192
 
 
 def evaluate_mesh(
@@ -57,7 +55,7 @@ def evaluate_mesh(
         "mesh_sdf_cm": 100 * float(np.mean(np.abs(error))),
     }
     if len(truth.thin_points_world):
-        scores["mesh_thin_share"] = _share(to_mesh(truth.thin_points_world), _KEPT)
+        scores["mesh_thin_share"] = _share(to_mesh(truth.thin_points_world), KEPT)
     if true_distance is not None and len(mesh.faces):
         import trimesh
 
@@ -122,9 +120,9 @@ def evaluate_steps(
     turn = rng.normal(size=(_SEGMENTS, 3))
     end = start + _SEGMENT * turn / np.linalg.norm(turn, axis=-1, keepdims=True)
     end = np.clip(end, low, high)
-    seen = _ask(observed, start, bool) & _ask(observed, end, bool)
+    seen = in_chunks(observed, start, bool) & in_chunks(observed, end, bool)
     start, end = start[seen], end[seen]
-    first, last = _ask(sdf, start, float), _ask(sdf, end, float)
+    first, last = in_chunks(sdf, start), in_chunks(sdf, end)
     step = np.abs(last - first)
     flips = start[(first < 0) != (last < 0)]
     far = np.sum(_distance_to(mesh)(flips) > 0.5 * voxel_size + _SEGMENT)
@@ -152,9 +150,3 @@ def _distance_to(mesh: trimesh.Trimesh) -> Callable[[np.ndarray], np.ndarray]:
 
 def _share(distance: np.ndarray, tolerance: float) -> float:
     return float(np.mean(distance < tolerance))
-
-
-def _ask(function: Callable[[np.ndarray], Any], points: np.ndarray, kind: type) -> np.ndarray:
-    values = np.empty(len(points), kind)
-    fill_in_chunks(lambda rows: (function(points[rows].astype(np.float32)),), {"": values}, _CHUNK)
-    return values
