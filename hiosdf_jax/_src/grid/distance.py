@@ -1,26 +1,17 @@
-"""The distance transform: every voxel's nearest surface patch, and its side of it.
-
-One exact transform per axis: the minimum over all sites within the horizon of a squared distance.
-A site lies at the center of its patch, not at that of its voxel.
-"""
+"""Every voxel's nearest surface patch, its side of it, and the distance."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
+from hiosdf_jax._src.grid.nearest import Part, nearest_sites
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
-from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
 from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid, Side
-
-_INFINITE = 1e12  # squared voxels
 
 # A voxel is free with at least this many passes per ray that ended just before it: noise puts some
 # ends of rays too far away.
@@ -48,106 +39,10 @@ _BLOCKED_VOXELS = 0.2
 # are so near, the surface that the rays ended on has vanished.
 _HIDDEN_REACH_VOXELS = HIDDEN_VOXELS + 2.0
 
-# Shifts in either direction between two optimization barriers.
-_CHUNK = 8
-
-
-class Part(NamedTuple):
-    """A box of voxels in an array.
-
-    Attributes:
-        start: Its first voxel, three int32 scalars.
-        shape: Its shape, static.
-    """
-
-    start: tuple[jax.Array | int, ...]
-    shape: tuple[int, ...]
-
-
-def nearest_sites(
-    sites: jax.Array,
-    offset: jax.Array,
-    horizon: int,
-    part: Part | None = None,
-    order: Sequence[int] = (2, 1, 0),
-) -> tuple[jax.Array, jax.Array]:
-    """Finds each voxel's nearest site by one exact transform per axis.
-
-    Args:
-        sites: Mask of the voxels that hold a site, (X, Y, Z) bool.
-        offset: Offset of the site from its voxel's center, (X, Y, Z, 3) voxels, in [-0.5, 0.5].
-        horizon: Largest distance along an axis, voxels.
-        part: The voxels to find sites for; all by default.
-        order: Order of the axes. Each transform cuts the box down to the part along its axis. The
-            result can depend on the order where sites lie off their voxels' centers.
-
-    Returns:
-        nearest: Flat index of the nearest site's voxel, (A, B, C) int32, of the part's shape; -1
-            where none is within the horizon.
-        squared: Squared distance of the voxel's center to it, (A, B, C) voxels^2.
-    """
-    start, shape = part or Part((0, 0, 0), sites.shape)
-    nearest = jnp.arange(sites.size, dtype=jnp.int32).reshape(sites.shape)
-    squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
-    for axis in order:
-        # A voxel's candidate lies at another place along this axis.
-        along = offset[..., axis].ravel()[nearest.ravel()].reshape(nearest.shape)
-        squared, shift = _transform_axis(squared, along, axis, horizon, start[axis], shape[axis])
-        row = jax.lax.broadcasted_iota(jnp.int32, shift.shape, axis) + start[axis] + shift
-        nearest = jnp.take_along_axis(nearest, row, axis)
-    found = squared <= horizon**2
-    return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
-
 
 def axis_order(config: Config) -> list[int]:
     """Returns the grid's axes, short ones first; all windows must use the same order."""
     return sorted(range(3), key=lambda k: config.grid_shape[k])
-
-
-def _transform_axis(
-    squared: jax.Array,
-    along: jax.Array,
-    axis: int,
-    horizon: int,
-    first: jax.Array | int,
-    length: int,
-) -> tuple[jax.Array, jax.Array]:
-    """Finds the least squared distance over shifts along an axis, for `length` voxels of it.
-
-    The candidate of the voxel k further along is at k + along from here. Its distance across the
-    axis is the same as there.
-
-    Args:
-        squared: Squared distance to each voxel's candidate, (X, Y, Z) voxels^2.
-        along: Offset of the candidate along the axis, (X, Y, Z) voxels.
-        axis: The axis.
-        horizon: Largest shift, voxels.
-        first: First voxel along the axis.
-        length: Voxels along the axis, static.
-
-    Returns:
-        The least squared distances and the shifts that give them, int32.
-    """
-    reach = min(horizon, squared.shape[axis] - 1)
-    across_all = pad_axis(squared - along * along, axis, reach, _INFINITE).part(first, length)
-    along_all = pad_axis(along, axis, reach).part(first, length)
-    best = jax.lax.dynamic_slice_in_dim(squared, first, length, axis)
-    shift = jnp.zeros(best.shape, jnp.int32)
-    # The compiler knows all shifts. The barriers keep XLA from computing what they have in common
-    # again for each shift.
-    values = jax.lax.optimization_barrier((across_all.values, along_all.values))
-    across, along_axis = (
-        array._replace(values=value)
-        for array, value in zip((across_all, along_all), values, strict=True)
-    )
-    for k in range(1, reach + 1):
-        for step in (-k, k):
-            candidate = across.shifted(step) + (step + along_axis.shifted(step)) ** 2
-            shift = jnp.where(candidate < best, step, shift)
-            best = jnp.minimum(best, candidate)
-        if k % _CHUNK == 0 or k == reach:
-            best, shift = jax.lax.optimization_barrier((best, shift))
-    return best, shift
 
 
 def update_distances(config: Config, grid: Grid, box: RayBox) -> Grid:
@@ -192,20 +87,23 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
     order = axis_order(config)
     features = patches.is_feature(config, hits, passes, axes)
-    nearest, _ = nearest_sites(features, mean, config.horizon_voxels, part, order)
     doubtful = patches.is_doubtful(hits, passes)
-    _, squared = nearest_sites(doubtful, mean, config.horizon_voxels, part, order)
+    sites = jnp.stack([features, doubtful])
+    indices, squares = nearest_sites(sites, mean, config.horizon_voxels, part, order)
+    nearest, squared = indices[0], squares[1]
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
 
     # From the centers of the part's voxels to their nearest patches.
     nearest = nearest.ravel()
     found, row = nearest >= 0, jnp.maximum(nearest, 0)
-    here = jnp.unravel_index(jnp.arange(nearest.size, dtype=jnp.int32), inner)
-    here = each(jnp.add, here, within)
-    jump = each(jnp.subtract, jnp.unravel_index(row, shape), here)
+    here = each(jnp.add, geometry.unflatten(inner, jnp.arange(row.size, dtype=jnp.int32)), within)
+    jump = each(jnp.subtract, geometry.unflatten(shape, row), here)
     means, spans = mean.reshape(-1, 3), axes.reshape(-1, 9)
-    long, middle, short = (take(spans, row, first) for first in (0, 3, 6))
-    patch = each(jnp.add, take(means, row), jump)
+    # Otherwise XLA gathers them again for each of the results.
+    row, here, jump, center, long, middle, short = jax.lax.optimization_barrier(
+        (row, here, jump, take(means, row), *(take(spans, row, first) for first in (0, 3, 6)))
+    )
+    patch = each(jnp.add, center, jump)
     offset = patches.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
     sure = hits.ravel()[row] >= _SURE_HITS
     marked = squared.ravel() < _HIDDEN_REACH_VOXELS**2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
@@ -42,12 +43,14 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
     # The remaining distance across the axis, for a voxel inside and for one outside.
     to_outside = pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE)
     to_inside = pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE)
-    best = squared
-    for k in range(1, reach + 1):
+
+    def compare(k: jax.Array, best: jax.Array) -> jax.Array:
         for step in (-k, k):
             across = jnp.where(inside, to_outside.shifted(step), to_inside.shifted(step))
-            best = jnp.minimum(best, across + (k - 0.5) ** 2)
-    return best
+            best = jnp.minimum(best, across + (k.astype(jnp.float32) - 0.5) ** 2)
+        return best
+
+    return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, squared)
 
 
 def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:

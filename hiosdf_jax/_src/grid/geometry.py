@@ -86,6 +86,15 @@ def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:
     return (index[0] * shape[1] + index[1]) * shape[2] + index[2]
 
 
+def unflatten(shape: tuple[int, ...], flat: jax.Array) -> Vector:
+    """Converts indices into a raveled array of this shape, >= 0, to indices (...) into the array.
+
+    `jnp.unravel_index` also takes negative indices, which costs five operations more per axis.
+    """
+    rows, z = jax.lax.div(flat, shape[2]), jax.lax.rem(flat, shape[2])
+    return jax.lax.div(rows, shape[1]), jax.lax.rem(rows, shape[1]), z
+
+
 class Corners(NamedTuple):
     """The eight voxels whose centers surround points, with trilinear interpolation weights.
 

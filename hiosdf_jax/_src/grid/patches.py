@@ -154,8 +154,10 @@ def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Arr
     Returns:
         (...) bool.
     """
-    half = EXTENT_DEVIATIONS * jnp.sqrt(jnp.sum(axes.astype(jnp.float32) ** 2, axis=-1))
-    area = jnp.prod(jnp.minimum(2 * half[..., :2], 1), axis=-1)
+    long, middle = (
+        length(split(axes[..., axis, :].astype(jnp.float32))) * EXTENT_DEVIATIONS for axis in (0, 1)
+    )
+    area = jnp.minimum(2 * long, 1) * jnp.minimum(2 * middle, 1)
     ratio = config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
     return (hits >= config.min_hits) & (hits >= ratio * (hits + jnp.abs(passes)))
 

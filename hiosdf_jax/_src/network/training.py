@@ -176,7 +176,8 @@ def train(
 
 def _is_finite(tree: Any) -> jax.Array:
     """Returns whether all numbers of a tree are finite, () bool."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+    leaves = [leaf.astype(jnp.float32).ravel() for leaf in jax.tree.leaves(tree)]
+    return jnp.all(jnp.isfinite(jnp.concatenate(leaves)))  # one kernel instead of one per leaf
 
 
 def _split(config: Config, samples: Samples, key: jax.Array) -> Samples:

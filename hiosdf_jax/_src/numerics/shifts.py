@@ -21,11 +21,11 @@ class Padded(NamedTuple):
     axis: int
     reach: int
 
-    def shifted(self, shift: int) -> jax.Array:
+    def shifted(self, shift: jax.Array | int) -> jax.Array:
         """Returns the array whose element i is element i + shift, without the margins."""
         size = self.values.shape[self.axis] - 2 * self.reach
         first = self.reach + shift
-        return jax.lax.slice_in_dim(self.values, first, first + size, axis=self.axis)
+        return jax.lax.dynamic_slice_in_dim(self.values, first, size, self.axis)
 
     def part(self, first: jax.Array | int, size: int) -> Padded:
         """Cuts the array down to `size` elements from `first` on, which need not be static."""

@@ -1,0 +1,177 @@
+"""Each voxel's nearest site, by one exact distance transform per axis.
+
+A transform takes the minimum over all sites within the horizon of a squared distance. A site lies
+at the center of its patch, not at that of its voxel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.numerics.shifts import pad_axis
+
+_INFINITE = 1e12  # squared voxels
+
+# A CPU transforms blocks of about this many voxels one after the other, so that they stay in its
+# cache: 0.7 of the time. A GPU transforms all voxels at once.
+_BLOCK = 100_000
+
+# A GPU takes this many shifts in either direction per step of the loop, to start fewer kernels. A
+# CPU takes one, which compiles faster and runs as fast.
+_UNROLL = 8
+
+
+class Part(NamedTuple):
+    """A box of voxels in an array.
+
+    Attributes:
+        start: Its first voxel, three int32 scalars.
+        shape: Its shape, static.
+    """
+
+    start: tuple[jax.Array | int, ...]
+    shape: tuple[int, ...]
+
+
+def nearest_sites(
+    sites: jax.Array,
+    offset: jax.Array,
+    horizon: int,
+    part: Part | None = None,
+    order: Sequence[int] = (2, 1, 0),
+) -> tuple[jax.Array, jax.Array]:
+    """Finds each voxel's nearest site, for several sets of sites at once.
+
+    Args:
+        sites: Masks of the voxels that hold a site, (S, X, Y, Z) bool.
+        offset: Offset of the site from its voxel's center, (X, Y, Z, 3) voxels, in [-0.5, 0.5].
+        horizon: Largest distance along an axis, voxels.
+        part: The voxels to find sites for; all by default.
+        order: Order of the axes. Each transform cuts the box down to the part along its axis. The
+            result can depend on the order where sites lie off their voxels' centers.
+
+    Returns:
+        nearest: Flat index of the nearest site's voxel, (S, A, B, C) int32, of the part's shape; -1
+            where none is within the horizon.
+        squared: Squared distance of the voxel's center to it, (S, A, B, C) voxels^2.
+    """
+    start, size = part or Part((0, 0, 0), sites.shape[1:])
+    squared = jnp.where(sites, jnp.sum(offset * offset, axis=-1), _INFINITE)
+    nearest = None
+    for axis in order:
+        # A voxel's candidate, at first its own site, lies at another place along this axis.
+        along = offset[..., axis]
+        along = jnp.broadcast_to(along, sites.shape) if nearest is None else _gather(along, nearest)
+        before = squared.shape
+        squared, shift = _transform_axis(squared, along, axis + 1, horizon, start[axis], size[axis])
+        chosen = _chosen(before, shift, axis + 1, start[axis])
+        own = jax.lax.rem(chosen, math.prod(before[1:]))
+        nearest = own if nearest is None else _gather(nearest, chosen)
+    assert nearest is not None, "no axis in order"
+    found = squared <= horizon**2
+    return jnp.where(found, nearest, -1), jnp.where(found, squared, _INFINITE)
+
+
+def _gather(values: jax.Array, index: jax.Array) -> jax.Array:
+    """Takes values at flat indices; unsigned ones need no check for negative numbers."""
+    return values.ravel()[index.astype(jnp.uint32)]
+
+
+def _chosen(
+    shape: tuple[int, ...], shift: jax.Array, axis: int, first: jax.Array | int
+) -> jax.Array:
+    """Returns flat indices of the voxels that lie `shift` voxels away along an axis.
+
+    Args:
+        shape: Shape of the array (S, X, Y, Z) that the indices are for.
+        shift: Shifts from the voxels of a part of it, int32.
+        axis: The axis, along which the part begins at `first`.
+        first: The first voxel.
+
+    Returns:
+        int32, of the shape of `shift`.
+    """
+    index = [jax.lax.broadcasted_iota(jnp.int32, shift.shape, k) for k in range(len(shape))]
+    index[axis] = index[axis] + first + shift
+    flat = jnp.zeros(shift.shape, jnp.int32)
+    for size, place in zip(shape, index, strict=True):
+        flat = flat * size + place
+    return flat
+
+
+def _transform_axis(
+    squared: jax.Array,
+    along: jax.Array,
+    axis: int,
+    horizon: int,
+    first: jax.Array | int,
+    length: int,
+) -> tuple[jax.Array, jax.Array]:
+    """Finds the least squared distance over shifts along an axis, for `length` voxels of it.
+
+    The candidate of the voxel k further along is at k + along from here. Its distance across the
+    axis is the same as there.
+
+    Args:
+        squared: Squared distance to each voxel's candidate, (S, X, Y, Z) voxels^2.
+        along: Offset of the candidate along the axis, (S, X, Y, Z) voxels.
+        axis: The axis.
+        horizon: Largest shift, voxels.
+        first: First voxel along the axis.
+        length: Voxels along the axis, static.
+
+    Returns:
+        The least squared distances and the shifts that give them, int32.
+    """
+    shape = squared.shape
+    rows = (math.prod(shape[:axis]), shape[axis], math.prod(shape[axis + 1 :]))
+    squared, along = squared.reshape(rows), along.reshape(rows)
+    across = 0 if rows[0] >= rows[2] else 2  # the axis to divide into blocks
+    blocks = -(-squared.size // _BLOCK) if jax.default_backend() == "cpu" else 1
+    size = -(-rows[across] // min(blocks, rows[across]))
+    blocks = -(-rows[across] // size)
+
+    def transform(block: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        # The last block overlaps the one before it.
+        begin = jnp.minimum(block * size, rows[across] - size)
+        near = jax.lax.dynamic_slice_in_dim(squared, begin, size, across)
+        offset = jax.lax.dynamic_slice_in_dim(along, begin, size, across)
+        found = _transform_block(near, offset, horizon, first, length)
+        return tuple(
+            jax.lax.dynamic_update_slice_in_dim(old, new, begin, across)
+            for old, new in zip(results, found, strict=True)
+        )
+
+    cut = (rows[0], length, rows[2])
+    results = (jnp.zeros(cut, squared.dtype), jnp.zeros(cut, jnp.int32))
+    best, shift = jax.lax.fori_loop(0, blocks, transform, results)
+    cut = (*shape[:axis], length, *shape[axis + 1 :])
+    return best.reshape(cut), shift.reshape(cut)
+
+
+def _transform_block(
+    squared: jax.Array, along: jax.Array, horizon: int, first: jax.Array | int, length: int
+) -> tuple[jax.Array, jax.Array]:
+    """Does the same for an array (A, N, B) along its middle axis."""
+    reach = min(horizon, squared.shape[1] - 1)
+    across = pad_axis(squared - along * along, 1, reach, _INFINITE).part(first, length)
+    along_axis = pad_axis(along, 1, reach).part(first, length)
+    best = jax.lax.dynamic_slice_in_dim(squared, first, length, 1)
+
+    def compare(k: jax.Array, found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        best, shift = found
+        for step in (-k, k):
+            candidate = across.shifted(step) + (step + along_axis.shifted(step)) ** 2
+            shift = jnp.where(candidate < best, step, shift)
+            best = jnp.minimum(best, candidate)
+        return best, shift
+
+    unroll = 1 if jax.default_backend() == "cpu" else _UNROLL
+    start = (best, jnp.zeros(best.shape, jnp.int32))
+    return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, start, unroll=unroll)
