@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.datasets import sensors
-from hiosdf_jax._src.datasets.files import parsing
+from hiosdf_jax._src.datasets.files import MOST_RETURNS, open_regular, parsing
 
 _to_cloud = jax.jit(sensors.depth_to_cloud)
 
@@ -62,7 +62,11 @@ def read_depth(
     """
     from PIL import Image
 
-    with parsing(path, "PNG image"), Image.open(path) as image:
+    with open_regular(path) as file, parsing(path, "PNG image"):
+        image = Image.open(file, formats=("PNG",))
+        width, height = image.size
+        if width * height > MOST_RETURNS:  # before a pixel is decoded
+            raise ValueError(f"{width} x {height} pixels, expected at most {MOST_RETURNS}")
         raw = np.asarray(image)
     if raw.dtype not in (np.uint16, np.int32) or raw.ndim != 2:  # int32 is Pillow's mode "I"
         raise ValueError(
