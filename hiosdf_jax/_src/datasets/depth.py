@@ -5,6 +5,7 @@ Pillow decodes the 16-bit PNGs; matplotlib depends on it anyway.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Sequence
 
@@ -63,7 +64,9 @@ def read_depth(
     from PIL import Image
 
     with open_regular(path) as file, parsing(path, "PNG image"):
-        image = Image.open(file, formats=("PNG",))
+        # From memory: Pillow asks a file for as many bytes as a chunk of it declares.
+        content = file.read()
+        image = Image.open(io.BytesIO(content), formats=("PNG",))
         width, height = image.size
         if width * height > MOST_RETURNS:  # before a pixel is decoded
             raise ValueError(f"{width} x {height} pixels, expected at most {MOST_RETURNS}")

@@ -130,9 +130,9 @@ def open_regular(path: _Path) -> io.BufferedReader:
         ValueError: It is a pipe, a device or a socket, or the path is none.
     """
     try:
-        mode = os.stat(path).st_mode
-    except ValueError as error:  # a null character in the name
-        raise ValueError(f"{str(path)!r}: {error}") from error
+        mode = os.stat(os.fspath(path)).st_mode
+    except (TypeError, ValueError) as error:  # such as a null character in the name
+        raise ValueError(f"path is {path!r}, expected the name of a file: {error}") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise ValueError(f"{path}: is a pipe or a device, expected a file")
     return open(path, "rb")

@@ -18,6 +18,7 @@ import numpy as np
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, open_regular, parsing, read_rows
 from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
 _INFO = ("replicaCAD_info.json", "cam_params.json")
@@ -62,10 +63,12 @@ def _camera(folder: Path) -> tuple[np.ndarray, float, tuple[int, int]]:
         info: dict[str, Any] = json.loads(file.read().decode("utf-8"))
     try:
         camera = info["camera"]
-        scale = float(info["depth_scale"] if "depth_scale" in info else camera["scale"])
-        values = [float(camera[key]) for key in ("fx", "fy", "cx", "cy")]
-        size = int(camera["w"]), int(camera["h"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        scale = as_number(
+            "scale", info["depth_scale"] if "depth_scale" in info else camera["scale"]
+        )
+        values = [as_number(key, camera[key]) for key in ("fx", "fy", "cx", "cy")]
+        size = int(as_number("w", camera["w"])), int(as_number("h", camera["h"]))
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path}: {error!r}, expected numbers depth_scale (or camera.scale) and camera.w, h, "
             "fx, fy, cx, cy"

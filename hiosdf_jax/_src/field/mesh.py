@@ -63,7 +63,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     if not len(faces):
         return trimesh.Trimesh()
     halvings = max(0, math.ceil(math.log2(config.voxel_size) - math.log2(spacing) - 1e-6))
-    triangles = len(faces) * 4**halvings
+    triangles = len(faces) * 4.0 ** min(halvings, 100)
     if triangles > _MOST_TRIANGLES:
         raise ValueError(
             f"resolution is {resolution} m, which needs {triangles:.3g} triangles, expected at "

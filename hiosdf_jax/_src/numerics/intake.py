@@ -129,5 +129,7 @@ def _has_mask(values: Any) -> bool:
 
 
 def _check_type(name: str, array: Any) -> None:
-    if not (jnp.issubdtype(array.dtype, np.floating) or jnp.issubdtype(array.dtype, np.integer)):
-        raise ValueError(f"{name} has dtype {array.dtype}, expected real numbers")
+    dtype = array.dtype
+    real = jnp.issubdtype(dtype, np.floating) or jnp.issubdtype(dtype, np.integer)
+    if not real or dtype.kind == "m":  # numpy counts spans of time among the integers
+        raise ValueError(f"{name} has dtype {dtype}, expected real numbers")

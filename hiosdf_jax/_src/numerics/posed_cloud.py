@@ -314,7 +314,7 @@ def _pose_fault(pose: np.ndarray) -> str:
 
 
 def _printed(matrix: np.ndarray) -> str:
-    return np.array2string(matrix, precision=4, separator=", ")
+    return " ".join(np.array2string(matrix, precision=4, separator=", ").split())  # in one line
 
 
 def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:
