@@ -127,7 +127,7 @@ def test_messages_name_the_bad_scene(tmp_path):
         read_scene(tmp_path, ORIGIN)
     text = tmp_path / "text.ply"
     text.write_text("not a mesh")
-    with pytest.raises(ValueError, match=r"text\.ply: cannot be read as a mesh"):
+    with pytest.raises(ValueError, match=r"text\.ply: not a readable mesh"):
         read_scene(text, ORIGIN)
     with pytest.raises(ValueError, match="0 triangles"):
         mesh_scene(trimesh.Trimesh(), ORIGIN)
