@@ -46,18 +46,18 @@ _SINCE = {
 # them first, and the values that the code of the older version had in their place.
 _FIELDS_SINCE = {3: {"min_in_range": 0.01, "most_refusals": 10, "vanish_scans": 3}}
 
-# What no map exceeds. Distances in the grid are at most 127 voxels of 10 m.
+# What no map exceeds. Distances in the grid are at most 127 voxels of 10 m along each axis.
 _LIMITS = {
     "grid.hits": (0, 65504),
     "grid.behind": (0, 65504),
     "grid.weight": (0, 65504),
     "grid.surface.mean": (-1, 1),
     "grid.surface.axes": (-1, 1),
-    "grid.surface.sdf": (-1270, 1270),
-    "grid.surface.doubt": (0, 1270),
+    "grid.surface.sdf": (-2200, 2200),
+    "grid.surface.doubt": (0, 2200),
     "grid.surface.side": (min(Side), max(Side)),
     "network.optimizer.0.count": (0, 2**31 - 1),
-    "optimism": (0, 1e4),
+    "optimism": (0, np.inf),
     "updates": (0, 2**31 - 1),
 }
 
