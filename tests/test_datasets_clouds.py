@@ -1,5 +1,7 @@
 """Folders of PLY and PCD clouds with a trajectory."""
 
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -129,3 +131,34 @@ def test_clouds_without_poses(tmp_path):
     with pytest.raises(ValueError, match=r"trajectory is one of \['more\.txt', 'poses\.txt'\]"):
         open_stream(folder)
     assert len(open_stream(folder, trajectory=folder / "more.txt")) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ((b"COUNT 1 1 1 1", b"COUNT 1 1 1 2000000000"), "of 2000000003 values, expected at most"),
+        ((b"POINTS 30", b"POINTS 3000000000"), "declares 3000000000 points"),
+        ((b"POINTS 30", b"POINTS 31"), "bytes of data, expected 4"),
+        ((b"DATA binary", b"DATA binary_compressed"), "inflates to"),
+    ],
+)
+def test_a_pcd_file_must_hold_what_it_declares(tmp_path, change, reason):
+    folder = write_clouds(tmp_path, range(FRAMES), ".pcd")
+    write_poses(tmp_path / "poses.txt", range(FRAMES))
+    path = folder / "1.pcd"  # binary
+    whole = path.read_bytes()
+    assert change[0] in whole
+    path.write_bytes(whole.replace(*change))
+    check_bad(open_stream(folder), 1, path, "not a readable PCD file", reason)
+
+
+def test_a_ply_file_must_hold_what_it_declares_and_opens_no_other(tmp_path):
+    folder = write_clouds(tmp_path, range(FRAMES))
+    write_poses(tmp_path / "poses.txt", range(FRAMES))
+    path = folder / "1.ply"
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"element vertex 30", b"element vertex 3000000000"))
+    check_bad(open_stream(folder), 1, path, "it declares 3000000000 of vertex in")
+    os.mkfifo(folder / "pipe.png")
+    path.write_bytes(whole.replace(b"format", b"comment TextureFile pipe.png\nformat", 1))
+    np.testing.assert_array_equal(open_stream(folder)[1][0], CLOUDS[1])

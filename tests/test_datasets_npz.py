@@ -136,7 +136,7 @@ def test_a_bad_pose_is_a_bad_frame(tmp_path):
         (DEPTH, {"poses": POSES[:2]}, r"poses has shape \(2, 4, 4\), expected \(3, 4, 4\)"),
         (DEPTH, {"poses": POSES[:, :3]}, r"poses has shape \(3, 3, 4\), expected \(3, 4, 4\)"),
         (DEPTH, {"poses": np.array(["a"])}, "poses has type <U1, expected numbers"),
-        (DEPTH, {"poses": np.array([None])}, "key 'poses' cannot be read"),
+        (DEPTH, {"poses": np.array([None])}, "key 'poses': not a readable array"),
         (RANGE, {"directions": DIRECTIONS[0]}, r"directions has shape \(6, 3\), expected \(2, 6"),
         (RANGE, {"range_scale": np.float32("nan")}, "range_scale = nan"),
         (RANGE, {"range": np.ones(3)}, r"range has shape \(3,\)"),

@@ -21,7 +21,7 @@ from recordings import (
     write_text,
 )
 
-from hiosdf_jax.datasets import open_stream, replicacad_stream
+from hiosdf_jax.datasets import open_stream, read_frame, replicacad_stream
 
 
 def write_replicacad(folder):
@@ -99,6 +99,10 @@ def test_camera_values_out_of_range(tmp_path):
     path.write_text(json.dumps(info | {"camera": info["camera"] | {"fx": -1}}))
     with pytest.raises(ValueError, match=r"info\.json: intrinsics are \[-1\.0, .*expected fx, fy"):
         open_stream(tmp_path)
+    for width in ("1e400", "NaN", '"7"', "[7]", "[" * 3000):
+        path.write_text(json.dumps(info).replace('"w": 7', f'"w": {width}'))
+        with pytest.raises(ValueError, match=r"replicaCAD_info\.json: "):
+            read_frame(open_stream(tmp_path), 0)
     path.unlink()
     with pytest.raises(ValueError, match="neither it nor its parent folder has one of"):
         open_stream(tmp_path)

@@ -1,6 +1,10 @@
 """Exported frames of ScanNet scenes."""
 
+import os
 import re
+import struct
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -37,3 +41,24 @@ def test_bad_files(tmp_path):
     path.unlink()
     with pytest.raises(FileNotFoundError):
         scannet_stream(folder)
+
+
+def test_images_are_checked_before_they_are_decoded(tmp_path):
+    """A kilobyte may declare gigabytes, and a pipe may never end."""
+    folder = write_scannet(tmp_path)
+    path = folder / "depth" / "9.png"
+    whole = path.read_bytes()
+    for width, height, reason in (
+        (9000, 9000, "9000 x 9000 pixels, expected at most 10000000"),
+        (30_000, 30_000, "decompression bomb"),
+        (2**31 - 1, 2**31 - 1, "not a readable PNG image"),
+    ):
+        head = b"IHDR" + struct.pack(">II", width, height) + whole[24:29]
+        path.write_bytes(whole[:12] + head + struct.pack(">I", zlib.crc32(head)) + whole[33:])
+        tracemalloc.start()
+        check_bad(scannet_stream(folder), 2, path, reason)
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+        tracemalloc.stop()
+    path.unlink()
+    os.mkfifo(path)
+    check_bad(scannet_stream(folder), 2, f"{path}: is a pipe or a device, expected a file")

@@ -92,3 +92,32 @@ def test_bad_frames_are_skipped_or_raise():
         find_bounds(room, skip_bad_frames=True)
     with pytest.raises(ValueError, match="margin = -1"):
         find_bounds(Room(), margin=-1)
+
+
+def test_a_stray_pose_does_not_enlarge_the_bounds():
+    room, expected = Room(frames=8), find_bounds(Room(frames=8))
+    for stray in (0, 3, 7):
+        cloud, pose = room.frames[stray]
+        room.frames[stray] = cloud, pose + 9e4 * np.eye(4, k=3, dtype=np.float32)
+        with pytest.warns(UserWarning, match=f"frame {stray} at .* is far from the frames before"):
+            np.testing.assert_allclose(find_bounds(room).bounds, expected.bounds, atol=0.2)
+        room.frames[stray] = cloud, pose
+    room.frames[3][1][0, 3] = 1e8
+    with pytest.raises(BadFrameError, match=r"^frame 3: pose is 1e\+05 km from the origin"):
+        find_bounds(room)
+
+
+def test_a_fast_sensor_has_no_stray_poses():
+    room = Room(frames=8)
+    for i, (_, pose) in enumerate(room.frames):
+        pose[0, 3] = 500 * i
+    assert find_bounds(room, margin=0).bounds[1][0] >= 3500
+
+
+def test_returns_beyond_all_sensors_are_no_returns():
+    room = Room()
+    expected = find_bounds(room)
+    room.frames.append((room.frames[0][0] * np.float32(1e27), room.frames[0][1]))
+    with pytest.raises(BadFrameError, match=r"frame 4: none of its returns is nearer than 100 km"):
+        find_bounds(room)
+    assert find_bounds(room, skip_bad_frames=True) == expected

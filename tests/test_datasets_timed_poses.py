@@ -67,6 +67,7 @@ def test_files_of_poses(tmp_path):
         ("# t\n1 0 0 0 0 0 0 1 9", "line 2: 9 columns, expected 8"),
         ("1 0 0 zero 0 0 0 1", "line 1: could not convert string to float: 'zero'"),
         ("2 0 0 0 0 0 0 1\n\n1 0 0 0 0 0 0 1", "line 3: time 1.000000 s after 2.000000 s"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n1 2 0 0 0 0 0 1", "line 3: another pose at 1.000000"),
         ("nan 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1", "line 2: time 1.000000 s after nan s"),
     ],
 )

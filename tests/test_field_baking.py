@@ -130,7 +130,7 @@ def test_a_window_moves_without_another_compilation(field):
 
 def test_bad_arguments_are_named(field, baked):
     for bad, words in (
-        ({"resolution": 0.0}, "resolution is 0.0 m, expected > 0"),
+        ({"resolution": 0.0}, "resolution is 0.0, expected > 0"),
         ({"center": (0, 0, 0)}, "expected both or neither"),
         ({"center": (0, 0), "size": (1, 1, 1)}, r"center has shape \(2,\), expected \(3,\)"),
         ({"center": (0, 0, 0), "size": (1, 0, 1)}, "size is .*, expected three lengths > 0"),

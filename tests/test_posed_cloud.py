@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from poses import random_pose
 
 from hiosdf_jax._src.numerics.posed_cloud import (
+    as_traced,
     check_pose,
-    check_shapes,
     finite_rows,
     warn_out_of_range,
     warn_outside,
@@ -89,11 +89,11 @@ def test_clouds_without_returns_are_refused(cloud, message):
 
 
 def test_shapes_are_checked_without_values():
-    check_shapes(np.full((2, 3), np.nan), np.zeros((4, 4)))
+    as_traced(np.full((2, 3), np.nan), np.zeros((4, 4)))
     with pytest.raises(ValueError, match=r"cloud has shape \(2, 4\), expected \(N, 3\)"):
-        check_shapes(np.zeros((2, 4)), np.eye(4))
+        as_traced(np.zeros((2, 4)), np.eye(4))
     with pytest.raises(ValueError, match=r"pose has shape \(3, 3\), expected \(4, 4\)"):
-        check_shapes(np.zeros((2, 3)), np.eye(3))
+        as_traced(np.zeros((2, 3)), np.eye(3))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,9 @@ import math
 import numbers
 from typing import Any
 
+from hiosdf_jax._src.numerics.intake import as_real
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M
+
 Point = tuple[float, float, float]
 Bounds = tuple[Point, Point]
 
@@ -148,12 +151,10 @@ class Config:
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", _checked_bounds(self.bounds))
         noise = self.range_noise
-        try:
-            floor, growth = (float(value) for value in noise)
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"Config.range_noise is {noise!r}, expected two numbers (a, b)"
-            ) from None
+        pair = as_real("Config.range_noise", noise)
+        if pair.shape != (2,):
+            raise ValueError(f"Config.range_noise is {noise!r}, expected two numbers (a, b)")
+        floor, growth = float(pair[0]), float(pair[1])
         object.__setattr__(self, "range_noise", (floor, growth))
         for field in dataclasses.fields(self):
             if "limits" not in field.metadata:
@@ -177,6 +178,11 @@ class Config:
             raise ValueError(
                 f"Config.max_range is {self.max_range!r}, expected more than min_range, "
                 f"{self.min_range!r}"
+            )
+        if self.min_hits > self.evidence_limit:
+            raise ValueError(
+                f"Config.min_hits is {self.min_hits!r}, expected at most evidence_limit, "
+                f"{self.evidence_limit!r}: no voxel would remember enough hits"
             )
         for name, horizon in (
             ("distance_horizon", self.horizon_voxels),
@@ -323,17 +329,20 @@ def _known(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _checked_bounds(bounds: Any) -> Bounds:
-    try:
-        low, high = (tuple(float(value) for value in corner) for corner in bounds)
-    except (TypeError, ValueError):
-        low, high = (), ()
-    if len(low) != 3 or len(high) != 3:
+    corners = as_real("Config.bounds", bounds)
+    if corners.shape != (2, 3):
         raise ValueError(
             f"Config.bounds is {bounds!r}, expected two corners ((x0, y0, z0), (x1, y1, z1))"
         )
+    low, high = corners.astype(float).tolist()
     for axis, least, greatest in zip("xyz", low, high, strict=True):
         if not (math.isfinite(least) and math.isfinite(greatest) and least < greatest):
             raise ValueError(
                 f"Config.bounds has {axis} from {least} to {greatest}, expected finite, ascending"
+            )
+        if max(-least, greatest) > FARTHEST_M:
+            raise ValueError(
+                f"Config.bounds has {axis} from {least} to {greatest}, expected at most "
+                f"{FARTHEST_M / 1000:g} km from the origin; are they in m?"
             )
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])

@@ -12,16 +12,20 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 from collections.abc import Callable
+from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import parsing
+from hiosdf_jax._src.datasets.files import MOST_RETURNS, open_regular, parsing
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses
 
 _MAX_GAP = 0.2  # s
+_PCD_LINES = 10  # of a header
+_PCD_VALUES = 1000  # per point
 _NANOSECONDS = 1e17  # times from here on are in nanoseconds
 
 
@@ -102,25 +106,65 @@ def _stamp(path: Path) -> float:
 def _read_ply(path: Path) -> np.ndarray:
     import trimesh
 
-    with parsing(path, "PLY file"):
-        vertices = getattr(trimesh.load(path, process=False), "vertices", None)
+    with open_regular(path) as file, parsing(path, "PLY file"):
+        header = file.read(65536).split(b"end_header")[0].decode("ascii", "replace")
+        size = file.seek(0, os.SEEK_END)
+        for name, count in re.findall(r"^element (\w+)\s+(\d+)", header, re.MULTILINE):
+            if int(count) > size:  # each takes a byte at least
+                raise ValueError(f"it declares {count} of {name} in {size} bytes")
+        file.seek(0)
+        # Without the path, trimesh does not open other files that this one names.
+        vertices = getattr(trimesh.load(file, "ply", process=False), "vertices", None)
         cloud = np.zeros((0, 3)) if vertices is None else np.asarray(vertices)
         # trimesh reads an ASCII file that is cut off after a line as a smaller cloud.
-        with open(path, "rb") as file:
-            header = file.read(65536).split(b"end_header")[0].decode("ascii", "replace")
-        count = re.search(r"^element vertex (\d+)", header, re.MULTILINE)
-        _check_count(cloud, int(count[1]) if count else len(cloud))
+        vertex = re.search(r"^element vertex (\d+)", header, re.MULTILINE)
+        _check_count(cloud, int(vertex[1]) if vertex else len(cloud))
     return cloud
 
 
 def _read_pcd(path: Path) -> np.ndarray:
     from pypcd4 import PointCloud  # pyright: ignore[reportPrivateImportUsage]
 
-    with parsing(path, "PCD file"):
-        content = PointCloud.from_path(path)
+    with open_regular(path) as file, parsing(path, "PCD file"):
+        _check_declared(file)
+        file.seek(0)
+        content = PointCloud.from_fileobj(file)
         cloud = content.numpy(("x", "y", "z")).reshape(-1, 3)  # a single point comes as a row
         _check_count(cloud, content.metadata.points)
     return cloud
+
+
+def _check_declared(file: BufferedReader) -> None:
+    """Compares what a PCD file declares with its size, before memory is taken for it."""
+    from pypcd4 import Encoding, MetaData  # pyright: ignore[reportPrivateImportUsage]
+
+    lines: list[str] = []
+    while len(lines) < _PCD_LINES and not (lines and lines[-1].startswith("DATA")):
+        text = file.readline(65536).decode("utf-8")
+        if not text:
+            break
+        if text.strip() and not text.startswith("#"):
+            lines.append(text.strip())
+    header = MetaData.parse_header(lines)
+    start = file.tell()
+    rest = file.seek(0, os.SEEK_END) - start
+    values = sum(header.count)
+    size = header.points * sum(a * b for a, b in zip(header.size, header.count, strict=True))
+    least = size
+    if header.data == Encoding.ASCII:
+        least = 2 * header.points * values - 1  # a digit and a space
+    elif header.data != Encoding.BINARY and header.points:
+        file.seek(start)
+        least, inflated = struct.unpack("<II", file.read(8))
+        if inflated != size:
+            raise ValueError(f"it inflates to {inflated} bytes, expected {size}")
+    if header.points > MOST_RETURNS or values > _PCD_VALUES:
+        raise ValueError(
+            f"it declares {header.points} points of {values} values, expected at most "
+            f"{MOST_RETURNS} of {_PCD_VALUES}"
+        )
+    if least > rest:
+        raise ValueError(f"it has {rest} bytes of data, expected {least}; is it cut off?")
 
 
 def _check_count(cloud: np.ndarray, expected: int) -> None:

@@ -5,6 +5,7 @@ Pillow decodes the 16-bit PNGs; matplotlib depends on it anyway.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Sequence
 
@@ -12,7 +13,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.datasets import sensors
-from hiosdf_jax._src.datasets.files import parsing
+from hiosdf_jax._src.datasets.files import MOST_RETURNS, open_regular, parsing
 
 _to_cloud = jax.jit(sensors.depth_to_cloud)
 
@@ -62,7 +63,13 @@ def read_depth(
     """
     from PIL import Image
 
-    with parsing(path, "PNG image"), Image.open(path) as image:
+    with open_regular(path) as file, parsing(path, "PNG image"):
+        # From memory: Pillow asks a file for as many bytes as a chunk of it declares.
+        content = file.read()
+        image = Image.open(io.BytesIO(content), formats=("PNG",))
+        width, height = image.size
+        if width * height > MOST_RETURNS:  # before a pixel is decoded
+            raise ValueError(f"{width} x {height} pixels, expected at most {MOST_RETURNS}")
         raw = np.asarray(image)
     if raw.dtype not in (np.uint16, np.int32) or raw.ndim != 2:  # int32 is Pillow's mode "I"
         raise ValueError(

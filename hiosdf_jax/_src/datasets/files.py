@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import os
 import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +14,12 @@ from pathlib import Path
 import numpy as np
 
 _Path = str | os.PathLike[str]
+
+MOST_RETURNS = 10_000_000
+"""Larger clouds are refused where a small file could hold one: in compressed images and clouds."""
+
+_LONGEST_LINE = 10_000
+_MOST_CHARACTERS = 300  # of a parser's message
 
 
 def read_rows(path: _Path, columns: int) -> tuple[np.ndarray, list[int]]:
@@ -51,15 +60,37 @@ def read_words(path: _Path, columns: int) -> Iterator[tuple[int, list[str]]]:
         FileNotFoundError: There is no such file.
         ValueError: A line has more words or fewer; the message names file and line.
     """
+    for line, text in read_lines(path):
+        words = text.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) != columns:
+            raise ValueError(f"{path}, line {line}: {len(words)} columns, expected {columns}")
+        yield line, words
+
+
+def read_lines(path: _Path) -> Iterator[tuple[int, str]]:
+    """Reads a text file line by line.
+
+    Args:
+        path: The file.
+
+    Yields:
+        The line number, from 1, and the line.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no regular file, or a line is too long; the message names the file.
+    """
     # Bytes that are not UTF-8 are no number either, and are reported as such.
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for line, text in enumerate(file, 1):
-            words = text.split()
-            if not words or words[0].startswith("#"):
-                continue
-            if len(words) != columns:
-                raise ValueError(f"{path}, line {line}: {len(words)} columns, expected {columns}")
-            yield line, words
+    with io.TextIOWrapper(open_regular(path), encoding="utf-8", errors="replace") as file:
+        for line in itertools.count(1):
+            text = file.readline(_LONGEST_LINE)
+            if not text:
+                return
+            if len(text) == _LONGEST_LINE:
+                raise ValueError(f"{path}, line {line}: longer than {_LONGEST_LINE} characters")
+            yield line, text
 
 
 def numbered_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
@@ -83,6 +114,30 @@ def numbered_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
     return found
 
 
+def open_regular(path: _Path) -> io.BufferedReader:
+    """Opens a file for reading, and nothing else: opening a pipe or a device could wait forever.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The open file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        IsADirectoryError: It is a folder.
+        PermissionError: It may not be read.
+        ValueError: It is a pipe, a device or a socket, or the path is none.
+    """
+    try:
+        mode = os.stat(os.fspath(path)).st_mode
+    except (TypeError, ValueError) as error:  # such as a null character in the name
+        raise ValueError(f"path is {path!r}, expected the name of a file: {error}") from error
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise ValueError(f"{path}: is a pipe or a device, expected a file")
+    return open(path, "rb")
+
+
 @contextmanager
 def parsing(path: _Path, kind: str) -> Iterator[None]:
     """Turns any error of a parser into a ValueError that names the file.
@@ -100,6 +155,14 @@ def parsing(path: _Path, kind: str) -> Iterator[None]:
     except OSError as error:
         if error.filename is not None:
             raise
-        raise ValueError(f"{path}: not a readable {kind} ({error})") from error
+        raise ValueError(_unreadable(path, kind, error)) from error
     except Exception as error:  # parsers raise anything on unexpected bytes
-        raise ValueError(f"{path}: not a readable {kind} ({error})") from error
+        raise ValueError(_unreadable(path, kind, error)) from error
+
+
+def _unreadable(path: _Path, kind: str, error: Exception) -> str:
+    """One line, also where a parser shows half of the file."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    if len(reason) > _MOST_CHARACTERS:
+        reason = f"{reason[:_MOST_CHARACTERS]} ..."
+    return f"{path}: not a readable {kind} ({reason})"

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import numbered_files, read_rows
+from hiosdf_jax._src.datasets.files import numbered_files, open_regular, read_lines, read_rows
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
@@ -56,26 +56,28 @@ def kitti_stream(folder: str | os.PathLike[str]) -> FrameStream:
 
 
 def _read_scan(path: Path) -> np.ndarray:
-    size = path.stat().st_size
-    if size % _BYTES:
-        raise ValueError(f"{path}: {size} bytes, expected a multiple of {_BYTES}; is it cut off?")
-    return np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
+    with open_regular(path) as file:
+        content = file.read()
+    if len(content) % _BYTES:
+        raise ValueError(
+            f"{path}: {len(content)} bytes, expected a multiple of {_BYTES}; is it cut off?"
+        )
+    return np.frombuffer(content, "<f4").reshape(-1, 4)[:, :3]
 
 
 def _calibration(path: Path) -> np.ndarray:
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for line, text in enumerate(file, 1):
-            key, _, rest = text.partition(":")
-            if key.strip() != "Tr":
-                continue
-            source = f"{path}, line {line}"
-            try:
-                values = np.array([float(word) for word in rest.split()])
-            except ValueError as error:
-                raise ValueError(f"{source}: {error}") from error
-            if len(values) != 12:
-                raise ValueError(f"{source}: {len(values)} numbers, expected 12")
-            return check_pose(_square(values), source)
+    for line, text in read_lines(path):
+        key, _, rest = text.partition(":")
+        if key.strip() != "Tr":
+            continue
+        source = f"{path}, line {line}"
+        try:
+            values = np.array([float(word) for word in rest.split()])
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
+        if len(values) != 12:
+            raise ValueError(f"{source}: {len(values)} numbers, expected 12")
+        return check_pose(_square(values), source)
     raise ValueError(f"{path}: no line 'Tr:', expected T_camera_velodyne there")
 
 

@@ -14,16 +14,16 @@ The optional `eval_*` arrays are exact distances, see `read_truth`.
 
 from __future__ import annotations
 
+import math
 import os
-import zipfile
-import zlib
 from functools import partial
 
 import jax
 import numpy as np
-from numpy.lib.npyio import NpzFile
 
 from hiosdf_jax._src.datasets import sensors
+from hiosdf_jax._src.datasets.archive import Archive
+from hiosdf_jax._src.datasets.files import MOST_RETURNS
 from hiosdf_jax._src.datasets.stream import frame_index
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.numerics.posed_cloud import check_pose
@@ -62,23 +62,23 @@ class NpzStream:
                 the message names the file, the key, what was found and what was expected.
         """
         self.path = path
-        with _open(path) as arrays:
-            layouts = [key for key in _LAYOUTS if key in arrays]
+        with Archive(path) as archive:
+            layouts = [key for key in _LAYOUTS if key in archive.names]
             if len(layouts) != 1:
                 raise ValueError(
                     f"{path}: has {layouts or 'none'} of the keys {list(_LAYOUTS)}, expected one"
                 )
             self._layout = layouts[0]
             keys = ("poses", self._layout, *_LAYOUTS[self._layout])
-            missing = [key for key in keys if key not in arrays]
+            missing = [key for key in keys if key not in archive.names]
             if missing:
                 raise ValueError(
                     f"{path}: key {missing[0]!r} is missing, expected {list(keys)} in a file with "
                     f"{self._layout!r}"
                 )
-            if self._layout == "depth" and "invalid" in arrays:
+            if self._layout == "depth" and "invalid" in archive.names:
                 keys = (*keys, "invalid")
-            self._arrays = {key: _array(arrays, key, path) for key in keys}
+            self._arrays = {key: _array(archive, key) for key in keys}
         check = {"depth": self._check_depth, "range": self._check_range}
         frames = check.get(self._layout, self._check_points)()
         self._expect("poses", (frames, 4, 4))
@@ -121,6 +121,7 @@ class NpzStream:
             raise ValueError(f"{self.path}: K = {matrix.tolist()}, expected focal lengths > 0")
         self._scale = self._positive("depth_scale")
         self._to_cloud = partial(_depth_to_cloud, intrinsics=matrix.astype(np.float32))
+        self._check_size(depth)
         return len(depth)
 
     def _check_range(self) -> int:
@@ -131,7 +132,15 @@ class NpzStream:
         self._scale = self._positive("range_scale")
         directions = self._arrays["directions"].astype(np.float32)
         self._to_cloud = partial(_ranges_to_cloud, directions=directions)
+        self._check_size(ranges)
         return len(ranges)
+
+    def _check_size(self, images: np.ndarray) -> None:
+        if math.prod(images.shape[1:]) > MOST_RETURNS:
+            raise ValueError(
+                f"{self.path}: {self._layout} has shape {images.shape}, expected at most "
+                f"{MOST_RETURNS} returns per frame"
+            )
 
     def _check_points(self) -> int:
         points, offsets = self._arrays["points_mm"], self._arrays["offsets"]
@@ -184,13 +193,13 @@ def read_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
     """
     keys = ("visible", "visible_sdf", "visible_grad", "visible_frame", "surface")
     keys = tuple(f"eval_{key}" for key in keys)
-    with _open(path) as arrays:
-        missing = [key for key in keys if key not in arrays]
+    with Archive(path) as archive:
+        missing = [key for key in keys if key not in archive.names]
         if len(missing) == len(keys):
             return None
         if missing:
             raise ValueError(f"{path}: key {missing[0]!r} is missing, expected {list(keys)}")
-        values = [_array(arrays, key, path) for key in keys]
+        values = [_array(archive, key) for key in keys]
     count = len(values[0]) if values[0].ndim else 0
     shapes = ((count, 3), (count,), (count, 3), (count,), ("M", 3))
     for key, value, shape in zip(keys, values, shapes, strict=True):
@@ -205,24 +214,11 @@ def read_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
     )
 
 
-def _open(path: str | os.PathLike[str]) -> NpzFile:
-    try:
-        arrays = np.load(path, allow_pickle=False)
-    except (zipfile.BadZipFile, EOFError, ValueError) as error:
-        raise ValueError(f"{path}: not a readable npz file ({error})") from error
-    if not isinstance(arrays, NpzFile):
-        raise ValueError(f"{path}: holds a single array, expected an npz file of named arrays")
-    return arrays
-
-
-def _array(arrays: NpzFile, key: str, path: str | os.PathLike[str]) -> np.ndarray:
-    try:
-        value = arrays[key]
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:  # or an object array
-        raise ValueError(f"{path}: key {key!r} cannot be read ({error})") from error
-    if value.dtype.kind not in "fiu":
-        raise ValueError(f"{path}: {key} has type {value.dtype}, expected numbers")
-    return value
+def _array(archive: Archive, key: str) -> np.ndarray:
+    kind = archive.describe(key).dtype
+    if kind.kind not in "fiu":
+        raise ValueError(f"{archive.path}: {key} has type {kind}, expected numbers")
+    return archive.read(key)
 
 
 def _expect(array: np.ndarray, key: str, shape: _Shape, path: str | os.PathLike[str]) -> None:

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
-from hiosdf_jax._src.datasets.files import numbered_files, parsing, read_rows
+from hiosdf_jax._src.datasets.files import numbered_files, open_regular, parsing, read_rows
 from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.numerics.posed_cloud import check_pose
 
 _INFO = ("replicaCAD_info.json", "cam_params.json")
@@ -58,13 +59,15 @@ def _camera(folder: Path) -> tuple[np.ndarray, float, tuple[int, int]]:
     path = next((path for path in candidates if path.is_file()), None)
     if path is None:
         raise ValueError(f"{folder}: neither it nor its parent folder has one of {list(_INFO)}")
-    with parsing(path, "JSON file"):
-        info: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    with open_regular(path) as file, parsing(path, "JSON file"):
+        info: dict[str, Any] = json.loads(file.read().decode("utf-8"))
     try:
         camera = info["camera"]
-        scale = float(info["depth_scale"] if "depth_scale" in info else camera["scale"])
-        values = [float(camera[key]) for key in ("fx", "fy", "cx", "cy")]
-        size = int(camera["w"]), int(camera["h"])
+        scale = as_number(
+            "scale", info["depth_scale"] if "depth_scale" in info else camera["scale"]
+        )
+        values = [as_number(key, camera[key]) for key in ("fx", "fy", "cx", "cy")]
+        size = int(as_number("w", camera["w"])), int(as_number("h", camera["h"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path}: {error!r}, expected numbers depth_scale (or camera.scale) and camera.w, h, "

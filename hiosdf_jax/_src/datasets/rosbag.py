@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import parsing
+from hiosdf_jax._src.datasets.files import open_regular, parsing
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses
 from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
@@ -70,6 +70,9 @@ def rosbag_stream(
             "ROS bags are read by rosbags: in a clone, pip install '.[ros]'"
         ) from error
     path = Path(path)
+    for each in path.iterdir() if path.is_dir() else [path]:
+        if not each.is_dir():
+            open_regular(each).close()
     with parsing(path, "ROS bag"):
         # Older ROS 2 bags do not contain their types; the types read here have not changed.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
@@ -110,9 +113,9 @@ def rosbag_stream(
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         start, among = times[index]
-        messages = reader.messages(clouds, start=start, stop=start + 1)
-        connection, _, raw = next(m for i, m in enumerate(messages) if i == among)
-        with parsing(f"{path}, {connection.topic} at {start} ns", "PointCloud2"):
+        with parsing(f"{path}, {clouds[0].topic} at {start} ns", "PointCloud2"):
+            messages = reader.messages(clouds, start=start, stop=start + 1)
+            connection, _, raw = next(m for i, m in enumerate(messages) if i == among)
             message: Any = reader.deserialize(raw, connection.msgtype)
             cloud = cloud_of(message)
         upward = path_up(edges, _name(message.header.frame_id), world_frame)

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from hiosdf_jax._src.numerics.intake import as_array
+
 
 def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
     """Converts depth images of a pinhole camera to clouds.
@@ -25,7 +27,8 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
     Raises:
         ValueError: Depth has fewer than two dimensions or intrinsics is not (3, 3).
     """
-    depth, intrinsics = jnp.asarray(depth), jnp.asarray(intrinsics)
+    depth = jnp.asarray(as_array("depth", depth))
+    intrinsics = jnp.asarray(as_array("intrinsics", intrinsics))
     if depth.ndim < 2:
         raise ValueError(f"depth has shape {depth.shape}, expected (..., H, W)")
     if intrinsics.shape != (3, 3):
@@ -52,7 +55,8 @@ def ranges_to_cloud(ranges: ArrayLike, directions: ArrayLike) -> Array:
     Raises:
         ValueError: Directions is not (*ranges.shape, 3).
     """
-    ranges, directions = jnp.asarray(ranges), jnp.asarray(directions)
+    ranges = jnp.asarray(as_array("ranges", ranges))
+    directions = jnp.asarray(as_array("directions", directions))
     expected = (*ranges.shape, 3)
     if directions.shape != expected:
         raise ValueError(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from hiosdf_jax._src.numerics.posed_cloud import check_pose, finite_rows
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 
 _POINTS_PER_FRAME = 5000  # drawn from each cloud
 # Mirrors, glass and dust make single returns far outside. Percentiles alone would cut off a room
@@ -17,6 +19,9 @@ _POINTS_PER_FRAME = 5000  # drawn from each cloud
 _CELL = 0.5  # m
 _MIN_POINTS_PER_CELL = 10
 _PERCENTILES = (0.1, 99.9)
+# A frame is stray if both neighbors are farther away than these many meters and usual steps.
+_JUMP_M, _JUMP_STEPS = 100.0, 100.0
+_LEAST_PATH = 4  # frames that show what is usual
 
 
 class Stream(Protocol):
@@ -167,7 +172,8 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
 
     Stray returns do not enlarge the box: on each side the outermost returns, up to 0.1 % of all,
     are left out unless 10 sampled returns share their cell of 0.5 m. The path of the sensor is
-    always inside.
+    always inside, but for frames 100 m and 100 usual steps away from the frames before and after
+    them: their poses are wrong, and a warning names them.
 
     Args:
         stream: The frames.
@@ -187,21 +193,38 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
     if not margin >= 0:
         raise ValueError(f"margin = {margin} m, expected >= 0")
     rng = np.random.default_rng(0)
-    points, ranges, path = [], [], []
+    frames, points, ranges, path = [], [], [], []
     for i in tqdm(range(len(stream)), desc="finding bounds", unit="frame"):
         try:
             cloud, pose = read_frame(stream, i)
+            cloud = cloud[(np.abs(cloud) <= FARTHEST_M).all(axis=-1)]  # False for NaN
+            if not len(cloud):
+                raise BadFrameError(
+                    f"frame {i}: none of its returns is nearer than {FARTHEST_M / 1000:g} km; is "
+                    "the unit m?"
+                )
         except BadFrameError:
             if not skip_bad_frames:
                 raise
             continue
-        cloud = cloud[np.isfinite(cloud).all(axis=-1)]
+        frames.append(i)
         cloud = rng.choice(cloud, min(_POINTS_PER_FRAME, len(cloud)), replace=False)
         points.append(cloud @ pose[:3, :3].T + pose[:3, 3])
         ranges.append(np.linalg.norm(cloud, axis=-1))
         path.append(pose[:3, 3])
     if not points:
         raise ValueError(f"none of the {len(stream)} frames can be used, expected at least one")
+    stray = _is_stray(np.array(path))
+    for k in np.flatnonzero(stray):
+        warnings.warn(
+            f"frame {frames[k]} at {path[k].tolist()} m is far from the frames before and after "
+            "it: is its pose wrong? The bounds leave it out",
+            stacklevel=2,
+        )
+    points, ranges, path = (
+        [part for part, far in zip(parts, stray, strict=True) if not far]
+        for parts in (points, ranges, path)
+    )
     points = np.concatenate(points)
     corners = np.concatenate(
         [np.percentile(points, _PERCENTILES, axis=0), points[_in_crowded_cells(points)], path]
@@ -212,6 +235,15 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
         bounds=((x0, y0, z0), (x1, y1, z1)),
         max_range=float(np.percentile(np.concatenate(ranges), _PERCENTILES[1])),
     )
+
+
+def _is_stray(path: np.ndarray) -> np.ndarray:
+    """Returns a mask, (F,) bool, of the positions (F, 3) m that the sensor cannot have reached."""
+    if len(path) < _LEAST_PATH:
+        return np.zeros(len(path), bool)
+    steps = np.linalg.norm(np.diff(path.astype(float), axis=0), axis=-1)
+    nearest = np.minimum(np.append(steps, np.inf), np.append(np.inf, steps))
+    return nearest > max(_JUMP_STEPS * np.median(steps), _JUMP_M)
 
 
 def _in_crowded_cells(points: np.ndarray) -> np.ndarray:

@@ -50,8 +50,8 @@ def read_timed_poses(path: str | os.PathLike[str]) -> TimedPoses:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: A line is malformed, a stamp is earlier than the one before it, or the file has
-            no pose.
+        ValueError: A line is malformed, a stamp is earlier than the one before it or repeats it
+            with another pose, or the file has no pose.
     """
     rows, lines = read_rows(path, 8)
     if not len(rows):
@@ -62,6 +62,14 @@ def read_timed_poses(path: str | os.PathLike[str]) -> TimedPoses:
         raise ValueError(
             f"{path}, line {lines[i]}: time {rows[i, 0]:.6f} s after {rows[i - 1, 0]:.6f} s, "
             "expected times that never decrease"
+        )
+    same = np.diff(rows[:, 0]) == 0
+    twice = np.flatnonzero(same & (np.diff(rows[:, 1:], axis=0) != 0).any(axis=1))
+    if len(twice):
+        i = twice[0] + 1
+        raise ValueError(
+            f"{path}, line {lines[i]}: another pose at {rows[i, 0]:.6f} s than in line "
+            f"{lines[i - 1]}, expected one pose at a time"
         )
     return TimedPoses(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
 

@@ -7,12 +7,12 @@ import math
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.lattice import sample_counts
 from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.numerics.intake import as_array, as_real, is_traced
 from hiosdf_jax._src.state import Baked, Field, MapState, field_of
 
 _CHUNK = 65536  # samples at a time: activations are many times larger than a sample
@@ -55,16 +55,17 @@ def bake(
         low, high = np.asarray(field.config.bounds)
         size, corner_world = high - low, jnp.asarray(low, jnp.float32)
     else:
-        size = np.asarray(size, float)
+        size = as_real("size", size).astype(float)
         if size.shape != (3,) or not (np.isfinite(size).all() and (size > 0).all()):
             raise ValueError(f"size is {size}, expected three lengths > 0, m")
-        center = jnp.asarray(center, jnp.float32)
+        center = jnp.asarray(as_array("center", center))
         if center.shape != (3,):
             raise ValueError(f"center has shape {center.shape}, expected (3,)")
-        if not isinstance(center, jax.core.Tracer) and not np.isfinite(center).all():
+        if not is_traced(center) and not np.isfinite(center).all():
             raise ValueError(f"center is {center}, expected finite coordinates, m")
         corner_world = center - jnp.asarray(size / 2, jnp.float32)
-    return _bake(field, corner_world, jnp.float32(resolution), sample_counts(size, resolution))
+    shape = sample_counts(size, resolution)
+    return _bake(field, corner_world, jnp.float32(resolution), shape)
 
 
 @functools.partial(jax.jit, static_argnums=3)

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.state import Baked, Unknown
 
 _MOST_SAMPLES = 2**31 - 1
@@ -55,22 +55,23 @@ def sample_counts(size: Any, resolution: float) -> tuple[int, int, int]:
     Raises:
         ValueError: The spacing is not positive, or needs too many samples.
     """
-    check_resolution(resolution)
+    spacing = check_resolution(resolution)
     # Tolerant, so that 3 m at 0.1 m are 31 samples and not 32.
-    intervals = np.ceil(np.asarray(size, float) / resolution - 1e-6)
-    x, y, z = (int(n) + 1 for n in np.maximum(intervals, 1))
-    if x * y * z > _MOST_SAMPLES:
+    with np.errstate(over="ignore"):
+        counts = np.maximum(np.ceil(np.asarray(size, float) / spacing - 1e-6), 1) + 1
+        total = counts.prod()
+    if not total <= _MOST_SAMPLES:
         raise ValueError(
-            f"resolution is {resolution} m, which needs {x * y * z} samples, expected at most "
+            f"resolution is {resolution} m, which needs {total:.10g} samples, expected at most "
             f"{_MOST_SAMPLES}"
         )
+    x, y, z = (int(count) for count in counts)
     return x, y, z
 
 
-def check_resolution(resolution: float) -> None:
-    """Raises a ValueError if a spacing, m, is not positive."""
-    if not (math.isfinite(resolution) and resolution > 0):
-        raise ValueError(f"resolution is {resolution} m, expected > 0")
+def check_resolution(resolution: Any) -> float:
+    """Returns a spacing, m, or raises a ValueError if it is not positive."""
+    return as_number("resolution", resolution, 0, above=True)
 
 
 def interpolate(baked: Baked, values: jax.Array, points_world: jax.Array) -> jax.Array:

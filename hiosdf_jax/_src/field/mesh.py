@@ -12,13 +12,17 @@ from hiosdf_jax._src.field import polygons
 from hiosdf_jax._src.field.lattice import check_resolution
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
-from hiosdf_jax._src.state import Field, MapState, surface_of
+from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.state import Field, MapState, field_of
 
 if TYPE_CHECKING:
     import trimesh
 
 # One batch shape for all vertices: one compilation, and memory does not grow with the map.
 _CHUNK = 65536
+
+# About 10 GB while they are made.
+_MOST_TRIANGLES = 50_000_000
 
 
 def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.Trimesh:
@@ -39,20 +43,33 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
         of the hits around each vertex along its normal, m.
 
     Raises:
-        ValueError: The resolution is not positive.
+        ValueError: `field` is something else, or traced; or the resolution is not positive, or
+            needs more than 50 million triangles.
 
     Example:
         >>> hio.extract_mesh(field, resolution=0.05).export("mesh.ply")
     """
     import trimesh
 
-    check_resolution(resolution)
-    config = field.config
-    surface = field.surface if isinstance(field, Field) else surface_of(field.grid)
+    if isinstance(field, MapState):
+        field = field_of(field)
+    if not isinstance(field, Field):
+        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    if is_traced(*jax.tree.leaves(field)):
+        raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
+    spacing = check_resolution(resolution)
+    config, surface = field.config, field.surface
     vertices, normals, faces = polygons.triangulate(surface)
     if not len(faces):
         return trimesh.Trimesh()
-    for _ in range(max(0, math.ceil(math.log2(config.voxel_size / resolution) - 1e-6))):
+    halvings = max(0, math.ceil(math.log2(config.voxel_size) - math.log2(spacing) - 1e-6))
+    triangles = len(faces) * 4.0 ** min(halvings, 100)
+    if triangles > _MOST_TRIANGLES:
+        raise ValueError(
+            f"resolution is {resolution} m, which needs {triangles:.3g} triangles, expected at "
+            f"most {_MOST_TRIANGLES}"
+        )
+    for _ in range(halvings):
         both = np.concatenate([vertices, normals], axis=-1)
         both, faces = trimesh.remesh.subdivide(both, faces)[:2]
         vertices, normals = both[:, :3], both[:, 3:]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.field import blend, lattice
 from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
+from hiosdf_jax._src.numerics.intake import as_array
 from hiosdf_jax._src.state import Baked, Field, MapState, Query, Unknown, field_of
 
 _FAR = 1e30  # m
@@ -177,10 +178,10 @@ def _place(field: Field | Baked, points: jax.Array) -> _Place:
 
 
 def _checked(points: Any, unknown: Any) -> jax.Array:
-    if unknown not in ("network", "obstacle"):
+    if not (isinstance(unknown, str) and unknown in ("network", "obstacle")):
         raise ValueError(f"unknown is {unknown!r}, expected 'network' or 'obstacle'")
-    points = jnp.asarray(points)
+    points = jnp.asarray(as_array("points", points))
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points has shape {points.shape}, expected (..., 3)")
     # Infinite points count as very far: inf - inf would be NaN.
-    return jnp.clip(points.astype(jnp.float32), -_FAR, _FAR)
+    return jnp.clip(points, -_FAR, _FAR)

@@ -7,8 +7,6 @@ import errno
 import json
 import os
 import uuid
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.datasets.archive import Archive
+from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.mapping.pipeline import init
-from hiosdf_jax._src.state import Grid, MapState, check_map
+from hiosdf_jax._src.state import Grid, MapState, Side, check_map
 
 _FORMAT = "hiosdf_jax map"
 _VERSION = 4
@@ -42,8 +42,24 @@ _SINCE = {
     4: ("grid.surface.side",),
 }
 
-# Raised by numpy and zipfile for damaged files and for files that are no archives.
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, KeyError)
+# Fields of the configuration that files of older versions do not have, by the version that has
+# them first, and the values that the code of the older version had in their place.
+_FIELDS_SINCE = {3: {"min_in_range": 0.01, "most_refusals": 10, "vanish_scans": 3}}
+
+# What no map exceeds. Distances in the grid are at most 127 voxels of 10 m along each axis.
+_LIMITS = {
+    "grid.hits": (0, 65504),
+    "grid.behind": (0, 65504),
+    "grid.weight": (0, 65504),
+    "grid.surface.mean": (-1, 1),
+    "grid.surface.axes": (-1, 1),
+    "grid.surface.sdf": (-2200, 2200),
+    "grid.surface.doubt": (0, 2200),
+    "grid.surface.side": (min(Side), max(Side)),
+    "network.optimizer.0.count": (0, 2**31 - 1),
+    "optimism": (0, np.inf),
+    "updates": (0, 2**31 - 1),
+}
 
 
 def save(path: str | os.PathLike[str], state: MapState) -> None:
@@ -96,54 +112,96 @@ def load(path: str | os.PathLike[str]) -> MapState:
         The map, as it was.
 
     Raises:
-        ValueError: The file is not a map, is damaged, or has another version. The message names the
-            file and the problem.
+        ValueError: The file is not a map, is damaged, has values that no map has, or another
+            version. The message names the file and the problem.
         FileNotFoundError: There is no such file.
+        IsADirectoryError: It is a folder.
 
     Example:
         >>> state = hio.load("house.npz")
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise
-    except _UNREADABLE as error:
-        # numpy suggests to unpickle files of other kinds.
-        reason = "it is none" if "pickle" in str(error) else error
-        raise ValueError(f"{path} is not a readable .npz file: {reason}") from error
-    try:
-        header = json.loads(str(arrays.pop("header")))
-        if header["format"] != _FORMAT:
-            raise KeyError
-        version, fields, key_impl = header["version"], header["config"], header["key"]
-    except (KeyError, TypeError, json.JSONDecodeError):
-        raise ValueError(f"{path} is not a hiosdf_jax map: it has no such header") from None
-    if version not in range(2, _VERSION + 1):
-        raise ValueError(f"{path} has format version {version}, expected 2 to {_VERSION}")
-    try:
-        config = Config(**fields)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} has no valid configuration: {error}") from error
-    template = jax.eval_shape(lambda: _without_key(init(config, jax.random.key(0, impl=key_impl))))
-    expected = _named_leaves(template)
-    for since, names in _SINCE.items():
-        if version < since:
-            new = {name: np.zeros(expected[name].shape, expected[name].dtype) for name in names}
-            arrays = new | arrays
-    for name, leaf in expected.items():
-        if name not in arrays:
-            raise ValueError(f"{path} lacks the array {name}")
-        if arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
-            raise ValueError(
-                f"{path} has {name} of {arrays[name].dtype} {arrays[name].shape}, "
-                f"expected {leaf.dtype} {leaf.shape}"
-            )
-    leaves = [jnp.asarray(arrays[name]) for name in expected]
+    with Archive(path) as archive:
+        version, config, key_impl = _read_header(archive)
+        template = jax.eval_shape(
+            lambda: _without_key(init(config, jax.random.key(0, impl=key_impl)))
+        )
+        expected = _named_leaves(template)
+        later = {name for since, names in _SINCE.items() if version < since for name in names}
+        for name in sorted(archive.names - {"header"} - expected.keys() | archive.names & later):
+            raise ValueError(f"{path} has the unknown array {name}")
+        for name, leaf in expected.items():  # all, before one is inflated
+            if name not in archive.names | later:
+                raise ValueError(f"{path} lacks the array {name}")
+            if name not in later:
+                entry = archive.describe(name)
+                if entry.shape != leaf.shape or entry.dtype != leaf.dtype:
+                    raise ValueError(
+                        f"{path} has {name} of {entry.dtype} {entry.shape}, "
+                        f"expected {leaf.dtype} {leaf.shape}"
+                    )
+        leaves = [
+            jnp.zeros(leaf.shape, leaf.dtype)
+            if name in later
+            else jnp.asarray(_in_range(path, name, archive.read(name, whole=True)))
+            for name, leaf in expected.items()
+        ]
     state = jax.tree.unflatten(jax.tree.structure(template), leaves)
     if version < 4:
         state = state.replace(grid=_with_sides(config, state.grid))
     return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))
+
+
+def _read_header(archive: Archive) -> tuple[int, Config, str]:
+    """The format version, the configuration and the kind of random key, all checked."""
+    path = archive.path
+    with parsing(path, "hiosdf_jax map"):
+        if "header" not in archive.names:
+            raise ValueError("it has no header")
+        text = archive.read("header")
+        if text.dtype.kind != "U" or text.shape != ():
+            raise ValueError(f"its header is {text.dtype} {text.shape}, expected text")
+        header = json.loads(str(text))
+        if not isinstance(header, dict) or header.get("format") != _FORMAT:
+            raise ValueError("it has no such header")
+        missing = {"version", "config", "key"} - header.keys()
+        if missing:
+            raise ValueError(f"its header lacks {sorted(missing)}")
+        version, fields, key_impl = header["version"], header["config"], header["key"]
+        if not isinstance(fields, dict) or key_impl not in ("threefry2x32", "rbg", "unsafe_rbg"):
+            raise ValueError(f"its header has the key {key_impl!r} and the config {fields!r}")
+    if type(version) is not int or version not in range(2, _VERSION + 1):
+        raise ValueError(
+            f"{path} has format version {version}, expected 2 to {_VERSION}; a map of another "
+            "version must be made again from its recording"
+        )
+    fields = dict(fields)
+    for since, added in _FIELDS_SINCE.items():
+        if version < since:
+            fields = added | fields
+    names = {field.name for field in dataclasses.fields(Config)}
+    if fields.keys() != names:
+        raise ValueError(
+            f"{path} has no valid configuration: it lacks {sorted(names - fields.keys())} and has "
+            f"the unknown {sorted(fields.keys() - names)}"
+        )
+    try:
+        return version, Config(**fields), key_impl
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} has no valid configuration: {error}") from error
+
+
+def _in_range(path: str | os.PathLike[str], name: str, array: np.ndarray) -> np.ndarray:
+    """Returns an array of a file, or raises a ValueError if no map has such values."""
+    if name.startswith("report."):  # what it says decides nothing, and a failed loss is NaN
+        return array
+    least, most = _LIMITS.get(name, (-np.inf, np.inf))
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{path} has {name} with values that are not finite")
+    if array.size and not (array.min() >= least and array.max() <= most):
+        raise ValueError(
+            f"{path} has {name} from {array.min()} to {array.max()}, expected {least} to {most}"
+        )
+    return array
 
 
 def _with_sides(config: Config, grid: Grid) -> Grid:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,6 +13,7 @@ from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.grid.frontier import recompute_frontier
+from hiosdf_jax._src.numerics.intake import as_floats, is_traced
 from hiosdf_jax._src.state import Evidence, Grid, MapState, check_map
 
 
@@ -34,19 +34,16 @@ def forget(state: MapState, box: Any) -> MapState:
         The map without this knowledge. It shares memory with the old map.
 
     Raises:
-        ValueError: `state` is not a map, or `box` is not two finite, ascending corners, or is
-            traced.
+        ValueError: `state` is not a map, or traced; or `box` is not two finite, ascending corners,
+            or is traced.
 
     Example:
         >>> state = hio.forget(state, ((1.0, 0.0, 0.0), (2.0, 0.2, 2.1)))
     """
     check_map(state)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(box)):
-        raise ValueError("box is traced, expected concrete numbers: call forget outside jit")
-    try:
-        corners = np.asarray(box, np.float32)
-    except (TypeError, ValueError):
-        corners = np.zeros(0)
+    if is_traced(*jax.tree.leaves(state)):
+        raise ValueError("state is traced, expected a map: call forget outside jit")
+    corners = as_floats("box", box)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
         raise ValueError(f"box is {box!r}, expected ((x0, y0, z0), (x1, y1, z1)), ascending")
     return state.replace(grid=_forget(state.config, state.grid, corners))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.mapping.stages import CHECKS, begin, run_stages
-from hiosdf_jax._src.numerics.posed_cloud import as_floats, check_extras, check_pose, check_shapes
+from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.posed_cloud import as_traced, check_extras, check_pose, checked_cloud
 from hiosdf_jax._src.state import MapState, check_map
 
 
@@ -54,16 +54,14 @@ def moving_rows(
     """
     check_map(state)
     extras = check_extras(robot, noise)
-    check_shapes(cloud, pose)
-    leaves = (*jax.tree.leaves((state, extras)), cloud, pose)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-        return _moving_rows(state, jnp.asarray(cloud), jnp.asarray(pose), *extras)
-    floats = as_floats("cloud", cloud)
+    if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
+        return _moving_rows(state, *as_traced(cloud, pose), *extras)
+    floats, matrix = checked_cloud(cloud), check_pose(pose)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
-    rows, step = np.shape(cloud)[0], state.config.max_points
+    rows, step = len(floats), state.config.max_points
     padded = np.full((-(-max(rows, 1) // step) * step, 3), np.nan, np.float32)
     padded[:rows] = floats
-    return _moving_rows_jit(state, padded, check_pose(pose), *extras)[:rows]
+    return _moving_rows_jit(state, padded, matrix, *extras)[:rows]
 
 
 def _moving_rows(
@@ -73,7 +71,6 @@ def _moving_rows(
     robot: tuple[jax.Array, jax.Array] | None,
     noise: jax.Array | None,
 ) -> jax.Array:
-    cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     checked = run_stages(begin(state, cloud, finite, pose, robot, noise), CHECKS)
     return checked.novelty.novel | checked.novelty.near_new

@@ -6,7 +6,6 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,9 +21,10 @@ from hiosdf_jax._src.mapping.stages import (
     run_stages,
 )
 from hiosdf_jax._src.network.training import init_network
+from hiosdf_jax._src.numerics.intake import as_array, is_traced
 from hiosdf_jax._src.numerics.posed_cloud import (
+    as_traced,
     check_extras,
-    check_shapes,
     prepare,
     warn_out_of_range,
     warn_outside,
@@ -132,10 +132,8 @@ def update(
     """
     check_map(state)
     extras = check_extras(robot, noise)
-    leaves = (*jax.tree.leaves((state, extras)), cloud, pose)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-        check_shapes(cloud, pose)
-        return _update(state, jnp.asarray(cloud), jnp.asarray(pose), *extras)
+    if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
+        return _update(state, *as_traced(cloud, pose), *extras)
     compiled = _update_donating if donate else _update_jit
     config = state.config
     cloud, pose = prepare(cloud, pose, config.max_points)
@@ -155,9 +153,17 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
 
     Returns:
         A field that shares no memory with the map.
+
+    Raises:
+        ValueError: `state` is not a map, or `stamp` is not one number, finite in float32.
     """
+    check_map(state)
+    seconds = as_array("stamp", stamp)
+    known = isinstance(seconds, jax.Array) or np.isfinite(seconds).all()  # nothing waits for it
+    if seconds.shape != () or not known:
+        raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
     field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=jnp.asarray(stamp, jnp.float32))
+    return field.replace(stamp=jnp.asarray(seconds))
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
@@ -172,8 +178,12 @@ def grow(state: MapState, bounds: Any) -> MapState:
         before inside the old box.
 
     Raises:
-        ValueError: The new bounds do not contain the old ones.
+        ValueError: `state` is not a map, or traced; or the new bounds do not contain the old ones,
+            or are none.
     """
+    check_map(state)
+    if is_traced(*jax.tree.leaves(state)):
+        raise ValueError("state is traced, expected a map: call grow outside jit")
     old = state.config
     new = dataclasses.replace(old, bounds=bounds)
     contained = np.all(np.asarray(new.bounds[0]) <= old.bounds[0]) and np.all(
@@ -197,7 +207,6 @@ def _update(
     robot: tuple[jax.Array, jax.Array] | None = None,
     noise: jax.Array | None = None,
 ) -> MapState:
-    cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
@@ -217,7 +226,10 @@ _update_donating = jax.jit(_update, donate_argnums=0, keep_unused=True)
 
 
 def _typed_key(key: Any) -> jax.Array:
-    array = jnp.asarray(key) if not isinstance(key, jax.Array) else key
+    try:
+        array = key if isinstance(key, jax.Array) else jnp.asarray(key)
+    except Exception as error:  # whatever a foreign object raises
+        raise ValueError(f"key is {type(key).__name__}, expected one jax.random.key") from error
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) and array.shape == ():
         return array
     if array.dtype == jnp.uint32 and array.shape == (2,):

@@ -7,10 +7,10 @@ import zlib
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.intake import as_array, as_floats, is_traced
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
@@ -23,18 +23,23 @@ LARGEST_RADIUS_M = 5.0
 """Larger spheres of a robot are in millimeters, or a mistake that would empty the map."""
 
 
-def check_shapes(cloud: Any, pose: Any) -> None:
-    """Checks shapes only, which tracers have as well.
+def as_traced(cloud: Any, pose: Any) -> tuple[jax.Array, jax.Array]:
+    """Checks types and shapes only, which tracers have as well.
 
     Args:
         cloud: Expected (N, 3).
         pose: Expected (4, 4).
 
+    Returns:
+        Both as arrays of JAX, float32.
+
     Raises:
-        ValueError: A shape is wrong.
+        ValueError: A type or a shape is wrong.
     """
+    cloud, pose = as_array("cloud", cloud), as_array("pose", pose)
     _check_cloud_shape(cloud)
     _check_pose_shape(pose)
+    return jnp.asarray(cloud), jnp.asarray(pose)
 
 
 def check_pose(pose: Any, source: str = "") -> np.ndarray:
@@ -63,30 +68,6 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
     return matrix
 
 
-def as_floats(name: str, values: Any) -> np.ndarray:
-    """Converts an argument to float32. Masked elements become NaN.
-
-    Args:
-        name: What messages call the argument.
-        values: Real numbers in an array, or what numpy makes one of.
-
-    Returns:
-        The array; not a copy if it is float32 already.
-
-    Raises:
-        ValueError: The values are no real numbers.
-    """
-    try:
-        array = np.ma.asanyarray(values) if np.ma.isMaskedArray(values) else np.asarray(values)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} is no array: {error}") from None
-    if not (jnp.issubdtype(array.dtype, np.floating) or jnp.issubdtype(array.dtype, np.integer)):
-        raise ValueError(f"{name} has dtype {array.dtype}, expected real numbers")
-    with np.errstate(over="ignore"):
-        floats = array.astype(np.float32, copy=False)
-    return np.ma.filled(floats, np.nan) if np.ma.isMaskedArray(floats) else floats
-
-
 def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
     """Checks the optional arguments of an update, of tracers only their shapes.
 
@@ -105,26 +86,25 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
             centers, radii = robot
         except (TypeError, ValueError):
             raise ValueError(f"robot is {robot!r}, expected (centers, radii)") from None
-        shapes = np.shape(centers), np.shape(radii)
-        if len(shapes[0]) != 2 or shapes != ((shapes[0][0], 3), (shapes[0][0],)):
+        centers, radii = as_array("robot centers", centers), as_array("robot radii", radii)
+        if centers.ndim != 2 or (centers.shape, radii.shape) != ((len(radii), 3), (len(radii),)):
             raise ValueError(
-                f"robot has centers of shape {shapes[0]} and radii of shape {shapes[1]}, "
+                f"robot has centers of shape {centers.shape} and radii of shape {radii.shape}, "
                 "expected (K, 3) and (K,)"
             )
         robot = None
-        if shapes[0][0] > 0:
+        if len(radii):
             _check_values("robot centers", centers, -np.inf)
             _check_values("robot radii", radii, 0, LARGEST_RADIUS_M)
-            robot = (jnp.asarray(centers, jnp.float32), jnp.asarray(radii, jnp.float32))
+            robot = (jnp.asarray(centers), jnp.asarray(radii))
     if noise is not None:
-        # Tracers in a tuple have no shape of their own.
-        shape = (len(noise),) if isinstance(noise, tuple | list) else np.shape(noise)
-        if shape != (2,):
-            raise ValueError(f"noise is {noise!r}, expected two numbers (a, b)")
-        floor, growth = noise
-        _check_values("noise a", floor, LEAST_NOISE_M)
-        _check_values("noise b", growth, 0)
-        noise = jnp.stack([jnp.asarray(floor, jnp.float32), jnp.asarray(growth, jnp.float32)])
+        given = noise
+        noise = as_array("noise", given)
+        if noise.shape != (2,):
+            raise ValueError(f"noise is {given!r}, expected two numbers (a, b)")
+        _check_values("noise a", noise[0], LEAST_NOISE_M)
+        _check_values("noise b", noise[1], 0)
+        noise = jnp.asarray(noise)
     return robot, noise
 
 
@@ -144,15 +124,26 @@ def extras_are_valid(
 
 
 def _check_values(name: str, values: Any, least: float, most_m: float = np.inf) -> None:
-    if isinstance(values, jax.core.Tracer):
+    if is_traced(values):
         return
-    array = as_floats(name, values)
+    array = np.asarray(values)
     came = f"{name} has values from {array.min()} to {array.max()}, expected"
     if not (np.isfinite(array).all() and (array >= np.float32(least)).all()):
         expected = "finite values" if least == -np.inf else f"finite values >= {least:.3g}"
         raise ValueError(f"{came} {expected}")
     if (array > most_m).any():
         raise ValueError(f"{came} meters, at most {most_m:g}; are they in millimeters?")
+
+
+def checked_cloud(cloud: Any) -> np.ndarray:
+    """Checks a cloud, and returns it as (N, 3) float32; masked elements are NaN.
+
+    Raises:
+        ValueError: It is no array of real numbers, or misshapen.
+    """
+    floats = as_floats("cloud", cloud)
+    _check_cloud_shape(floats)
+    return floats
 
 
 def finite_rows(cloud: Any) -> np.ndarray:
@@ -167,8 +158,7 @@ def finite_rows(cloud: Any) -> np.ndarray:
     Raises:
         ValueError: The cloud is misshapen or has no return.
     """
-    _check_cloud_shape(cloud)
-    x, y, z = np.asarray(cloud).T  # one column at a time is many times faster than all(axis=1)
+    x, y, z = checked_cloud(cloud).T  # one column at a time is many times faster than all(axis=1)
     finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     if not finite.any():
         raise ValueError(
@@ -193,7 +183,7 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         ValueError: A shape is wrong, the pose is not finite or not rigid, or the cloud has no
             finite row.
     """
-    cloud, pose = as_floats("cloud", cloud), check_pose(pose)
+    cloud, pose = checked_cloud(cloud), check_pose(pose)
     finite = finite_rows(cloud)
     padded = np.empty((capacity, 3), np.float32)
     count = len(cloud)
@@ -324,7 +314,7 @@ def _pose_fault(pose: np.ndarray) -> str:
 
 
 def _printed(matrix: np.ndarray) -> str:
-    return np.array2string(matrix, precision=4, separator=", ")
+    return " ".join(np.array2string(matrix, precision=4, separator=", ").split())  # in one line
 
 
 def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:

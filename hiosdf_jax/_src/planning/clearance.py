@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown, sdf, sdf_and_grad
+from hiosdf_jax._src.numerics.intake import as_array, is_traced
 
 
 def sphere_clearance(
@@ -34,8 +34,8 @@ def sphere_clearance(
     Raises:
         ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
     """
-    radii = checked_radii(radii, centers_world, "centers_world")
-    return sdf(field, centers_world, unknown) - radii
+    centers, radii = checked_spheres(centers_world, radii, "centers_world")
+    return sdf(field, centers, unknown) - radii
 
 
 def sphere_clearance_and_grad(
@@ -56,37 +56,38 @@ def sphere_clearance_and_grad(
     Raises:
         ValueError: As for `sphere_clearance`.
     """
-    radii = checked_radii(radii, centers_world, "centers_world")
-    value, gradient = sdf_and_grad(field, centers_world, unknown)
+    centers, radii = checked_spheres(centers_world, radii, "centers_world")
+    value, gradient = sdf_and_grad(field, centers, unknown)
     return value - radii, gradient
 
 
-def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
-    """Checks radii against the centers of their spheres.
+def checked_spheres(centers: Any, radii: Any, name: str) -> tuple[jax.Array, jax.Array]:
+    """Checks the centers of spheres, and their radii against them.
 
     Args:
-        radii: m.
         centers: (..., 3) m.
+        radii: m.
         name: The caller's name for the centers.
 
     Returns:
-        The radii, float32.
+        The centers and the radii, float32.
 
     Raises:
-        ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
+        ValueError: A type or a shape is wrong, or (outside jit) a radius is negative or not finite.
     """
-    shape = np.shape(centers)
+    centers, radii = as_array(name, centers), as_array("radii", radii)
+    shape = centers.shape
     if not shape or shape[-1] != 3:
         raise ValueError(f"{name} has shape {shape}, expected (..., 3)")
-    if not isinstance(radii, jax.core.Tracer):
-        values = np.asarray(radii, float)
+    if not is_traced(radii):
+        values = np.asarray(radii)
         wrong = ~((values >= 0) & np.isfinite(values))
         if wrong.any():
             raise ValueError(
                 f"radii has {wrong.sum()} negative or non-finite values, expected all >= 0: "
-                f"{values[wrong][:5].tolist()} at {np.argwhere(wrong)[:5].tolist()}"
+                f"{[float(f'{x:.6g}') for x in values[wrong][:5]]} at "
+                f"{np.argwhere(wrong)[:5].tolist()}"
             )
-    radii = jnp.asarray(radii, jnp.float32)
     # Radii must not enlarge the batch: each sphere has one.
     dimensions = zip(radii.shape[::-1], shape[-2::-1], strict=False)
     if radii.ndim >= len(shape) or any(own not in (1, batch) for own, batch in dimensions):
@@ -94,4 +95,4 @@ def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
             f"radii has shape {radii.shape}, expected one that broadcasts to {shape[:-1]}, "
             f"the spheres of {name}"
         )
-    return radii
+    return jnp.asarray(centers), jnp.asarray(radii)

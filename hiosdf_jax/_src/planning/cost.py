@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
+
+from hiosdf_jax._src.numerics.intake import as_array, is_traced
 
 
 def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
@@ -33,11 +34,11 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
     Raises:
         ValueError: (Outside jit) the margin is not positive and finite.
     """
-    if not isinstance(margin_m, jax.core.Tracer):
-        values = np.asarray(margin_m, float)
+    clearance, margin = as_array("clearance", clearance), as_array("margin_m", margin_m)
+    if not is_traced(margin):
+        values = np.asarray(margin)
         if not ((values > 0) & np.isfinite(values)).all():
             raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite")
-    clearance, margin = jnp.asarray(clearance, jnp.float32), jnp.asarray(margin_m, jnp.float32)
     # Clipped before squaring: an infinite clearance must not make the gradient NaN.
     shortfall = jnp.clip(margin - clearance, 0, margin)
     return shortfall**2 / (2 * margin) + jnp.maximum(-clearance, 0)

@@ -9,18 +9,15 @@ segment is enough far from surfaces, and the bound is tight where a sphere comes
 from __future__ import annotations
 
 import functools
-import math
-import numbers
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
-import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown, as_field, sdf
+from hiosdf_jax._src.numerics.intake import as_array, as_number, check_whole, is_traced
 from hiosdf_jax._src.numerics.vectors import length, split
-from hiosdf_jax._src.planning.clearance import checked_radii
+from hiosdf_jax._src.planning.clearance import checked_spheres
 
 # m; farther points are clipped, so that the square of a length does not overflow.
 _FAR = 1e18
@@ -68,20 +65,17 @@ def swept_clearance(
         ValueError: A shape or `evaluations` is wrong, or (outside jit) a radius is negative or not
             finite, or the slope is not positive.
     """
-    shapes = np.shape(start_world), np.shape(end_world)
+    start, radii = checked_spheres(start_world, radii, "start_world")
+    end = as_array("end_world", end_world)
+    shapes = start.shape, end.shape
     if shapes[0] != shapes[1]:
         raise ValueError(
             f"end_world has shape {shapes[1]}, expected that of start_world {shapes[0]}"
         )
-    radii = checked_radii(radii, start_world, "start_world")
-    if not isinstance(evaluations, numbers.Integral) or evaluations < 2:
-        raise ValueError(f"evaluations is {evaluations!r}, expected a whole number >= 2")
-    if not isinstance(slope, jax.core.Tracer) and not (math.isfinite(slope) and slope > 0):
-        raise ValueError(f"slope is {slope}, expected > 0 and finite")
-    start, end = (
-        jnp.clip(jnp.asarray(points, jnp.float32), -_FAR, _FAR)
-        for points in (start_world, end_world)
-    )
+    check_whole("evaluations", evaluations, 2)
+    if not is_traced(slope):
+        slope = as_number("slope", slope, 0, above=True)
+    start, end = (jnp.clip(points, -_FAR, _FAR) for points in (start, end))
     slope = jnp.asarray(slope, jnp.float32)
     answering = as_field(field)
     frozen = jax.lax.stop_gradient((answering, start, end, slope))

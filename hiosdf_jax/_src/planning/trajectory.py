@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +10,7 @@ import optax
 
 from hiosdf_jax._src.field.points import AnyField, Unknown, sdf_and_grad
 from hiosdf_jax._src.numerics.gradient import least
+from hiosdf_jax._src.numerics.intake import as_array, as_number, check_whole, is_traced
 from hiosdf_jax._src.numerics.vectors import length, split
 
 # Samples per segment that are held off the map; the last one is the segment's end.
@@ -52,11 +52,22 @@ def waves(
 
     Returns:
         (count, waypoints, 3) m.
+
+    Raises:
+        ValueError: A shape or a type is wrong, or a number is out of range.
     """
-    start, goal = jnp.asarray(start_world, jnp.float32), jnp.asarray(goal_world, jnp.float32)
+    start, goal = as_array("start_world", start_world), as_array("goal_world", goal_world)
+    for name, ends in (("start_world", start), ("goal_world", goal)):
+        if ends.shape != (3,):
+            raise ValueError(f"{name} has shape {ends.shape}, expected (3,)")
+    check_whole("count", count, 1)
+    check_whole("waypoints", waypoints, 2)
+    if not is_traced(spread_m):
+        spread_m = as_number("spread_m", spread_m, 0)
     along = jnp.linspace(0, 1, waypoints)[:, None]
     heights = spread_m * jax.random.normal(key, (count, 3, 3)).at[0].set(0)
     shapes = jnp.sin(jnp.pi * along * jnp.arange(1, 4))
+    start, goal = jnp.asarray(start), jnp.asarray(goal)
     return start + along * (goal - start) + shapes @ heights
 
 
@@ -99,15 +110,15 @@ def optimize_trajectory(
         The optimized paths, one per guess.
 
     Raises:
-        ValueError: `initial_world` has a wrong shape, or the radius or the margin is negative or
-            not finite.
+        ValueError: `initial_world` has a wrong shape or type, or a number is out of range.
     """
-    initial = jnp.asarray(initial_world, jnp.float32)
+    initial = jnp.asarray(as_array("initial_world", initial_world))
     if initial.ndim < 2 or initial.shape[-1] != 3 or initial.shape[-2] < 3:
         raise ValueError(f"initial_world has shape {initial.shape}, expected (..., N >= 3, 3)")
-    for name, value in (("radius_m", radius_m), ("margin_m", margin_m)):
-        if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} is {value!r}, expected >= 0 and finite")
+    radius_m, margin_m = as_number("radius_m", radius_m, 0), as_number("margin_m", margin_m, 0)
+    if not is_traced(step_m):
+        step_m = as_number("step_m", step_m, 0, above=True)
+    check_whole("steps", steps, 1)
     wanted = radius_m + margin_m
     segments = initial.shape[-2] - 1
     straight = jnp.maximum(length(split(initial[..., -1, :] - initial[..., 0, :])), 1e-3)

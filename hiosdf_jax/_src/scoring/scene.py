@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hiosdf_jax._src.datasets.files import open_regular, parsing, read_rows
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -75,10 +77,9 @@ def read_scene(path: str | os.PathLike[str], sensor_path_world: np.ndarray) -> S
         return grid_scene(path if path.is_dir() else path.parent)
     import trimesh
 
-    try:
+    open_regular(path).close()
+    with parsing(path, "mesh"):
         mesh = trimesh.load_mesh(path)
-    except Exception as error:  # readers of many formats raise anything
-        raise ValueError(f"{path}: cannot be read as a mesh ({error})") from error
     try:
         return mesh_scene(mesh, sensor_path_world)
     except ValueError as error:
@@ -282,20 +283,16 @@ def _thin_parts(mesh: trimesh.Trimesh) -> np.ndarray:
 def _read_grid(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The samples (X, Y, Z) float32 m, NaN for no data; their spacing (3,) and corner (3,), m."""
     grid_file, transform_file = folder / "sdf.npy", folder / "transform.txt"
-    try:
+    open_regular(grid_file).close()
+    with parsing(grid_file, "npy file"):
         # Memory-mapped, and converted to float32 below: at 1 cm an apartment takes gigabytes.
         grid = np.load(grid_file, mmap_mode="r", allow_pickle=False)
-    except (EOFError, ValueError) as error:
-        raise ValueError(f"{grid_file}: not a readable npy file ({error})") from error
     if not (isinstance(grid, np.ndarray) and grid.ndim == 3 and min(grid.shape) >= 2):
         found = getattr(grid, "shape", type(grid).__name__)
         raise ValueError(f"{grid_file}: has shape {found}, expected (X, Y, Z), each at least 2")
     if grid.dtype.kind != "f":
         raise ValueError(f"{grid_file}: has type {grid.dtype}, expected floating-point numbers")
-    try:
-        transform = np.loadtxt(transform_file)
-    except ValueError as error:
-        raise ValueError(f"{transform_file}: {error}, expected 4 lines of 4 numbers") from error
+    transform, _ = read_rows(transform_file, 4)
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         raise ValueError(
             f"{transform_file}: has shape {transform.shape}, expected 4 lines of 4 finite numbers"

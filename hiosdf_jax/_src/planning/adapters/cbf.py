@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown, sdf
+from hiosdf_jax._src.numerics.intake import as_number, as_real
+from hiosdf_jax._src.planning.clearance import checked_spheres
 from hiosdf_jax._src.state import Baked
 
 BodySpheres = Callable[[jax.Array], tuple[jax.Array, Any]]
@@ -63,13 +64,11 @@ def velocity_filter(
     Raises:
         ValueError: A limit or the gain is not positive, or the margin is negative.
     """
-    limits = np.asarray(velocity_limits, float)
+    limits = as_real("velocity_limits", velocity_limits).astype(float)
     if limits.ndim != 1 or not (np.isfinite(limits).all() and (limits > 0).all()):
         raise ValueError(f"velocity_limits is {velocity_limits!r}, expected shape (n,), all > 0")
-    if not (math.isfinite(margin_m) and margin_m >= 0):
-        raise ValueError(f"margin_m is {margin_m!r}, expected >= 0 and finite")
-    if not (math.isfinite(gain_per_s) and gain_per_s > 0):
-        raise ValueError(f"gain_per_s is {gain_per_s!r}, expected > 0 and finite")
+    margin_m = as_number("margin_m", margin_m, 0)
+    gain_per_s = as_number("gain_per_s", gain_per_s, 0, above=True)
     cbf = cbfpy.CBF.from_config(_Shares(spheres, limits, margin_m, gain_per_s, unknown))
 
     def filtered(field: AnyField, q: jax.Array, desired: jax.Array) -> jax.Array:
@@ -95,12 +94,13 @@ def inscribed(centers: Any, radii: Any, share: float = 0.5) -> tuple[jax.Array, 
         centers (7 S, 3) m and radii (7 S,) m; the given spheres come first.
 
     Raises:
-        ValueError: `share` is out of range.
+        ValueError: `share` is out of range, or a shape or a radius is wrong.
     """
-    if not 0 < share < 1:
+    share = as_number("share", share, 0, above=True)
+    if share >= 1:
         raise ValueError(f"share is {share!r}, expected 0 < share < 1")
-    centers = jnp.asarray(centers, jnp.float32)
-    radii = jnp.broadcast_to(jnp.asarray(radii, jnp.float32), centers.shape[:1])
+    centers, radii = checked_spheres(centers, radii, "centers")
+    radii = jnp.broadcast_to(radii, centers.shape[:1])
     axes = jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
     inner = centers + (1 - share) * radii[:, None] * axes[:, None, :]
     return (

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.field.points import AnyField, Unknown
 from hiosdf_jax._src.numerics.gradient import least, value_and_gradient
+from hiosdf_jax._src.numerics.intake import as_array
 from hiosdf_jax._src.planning.clearance import sphere_clearance
 
 if TYPE_CHECKING:
@@ -33,12 +34,16 @@ def arm_spheres(
     Raises:
         ValueError: The arm has no collision data, or a shape is wrong.
     """
-    q = jnp.asarray(q, jnp.float32)
+    q = jnp.asarray(as_array("q", q))
     if not arm.has_collision_data:
         raise ValueError("arm has no collision data, expected spheres on its links")
     if q.ndim == 0 or q.shape[-1] != arm.nq:
         raise ValueError(f"q has shape {q.shape}, expected (..., {arm.nq})")
-    pose = jnp.eye(4) if pose_world_base is None else jnp.asarray(pose_world_base)
+    pose = (
+        jnp.eye(4)
+        if pose_world_base is None
+        else jnp.asarray(as_array("pose_world_base", pose_world_base))
+    )
     if pose.shape != (4, 4):
         raise ValueError(f"pose_world_base has shape {pose.shape}, expected (4, 4)")
     flat = jax.vmap(arm.link_collision_positions)(q.reshape(-1, arm.nq))
@@ -102,5 +107,5 @@ def arm_clearance_and_grad(
     Raises:
         ValueError: As for `arm_spheres`.
     """
-    q = jnp.asarray(q, jnp.float32)
+    q = jnp.asarray(as_array("q", q))
     return value_and_gradient(lambda q: arm_clearance(field, arm, q, pose_world_base, unknown), q)

@@ -13,6 +13,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from hiosdf_jax._src.numerics.intake import as_array, check_whole
+
 
 class Rollout(NamedTuple):
     """States after each control.
@@ -69,10 +71,10 @@ def rollout(
     Raises:
         ValueError: `controls` has a wrong shape, or `steps_per_control` < 1.
     """
+    controls = jnp.asarray(as_array("controls", controls))
     if controls.ndim < 2 or controls.shape[-1] != model.nu:
         raise ValueError(f"controls has shape {controls.shape}, expected (..., H, {model.nu})")
-    if steps_per_control < 1:
-        raise ValueError(f"steps_per_control is {steps_per_control!r}, expected >= 1")
+    check_whole("steps_per_control", steps_per_control, 1)
 
     def hold(state: mjx.Data, control: jax.Array) -> tuple[mjx.Data, Rollout]:
         state = state.replace(ctrl=control)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown
 from hiosdf_jax._src.numerics.gradient import least
+from hiosdf_jax._src.numerics.intake import as_array, as_number
 from hiosdf_jax._src.planning.clearance import sphere_clearance
 from hiosdf_jax._src.planning.robot import cover, solids
 
@@ -77,11 +77,10 @@ def spheres_from_model(
         ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen, or
             a chosen geom is a plane, a height field or an SDF.
     """
-    if isinstance(tolerance_m, bool) or not (math.isfinite(tolerance_m) and tolerance_m > 0):
-        raise ValueError(f"tolerance_m is {tolerance_m}, expected > 0 and finite")
+    tolerance_m = as_number("tolerance_m", tolerance_m, 0, above=True)
     parts = []
     for geom in _chosen_geoms(model, bodies, geoms):
-        centers, radii = _cover_geom(model, geom, float(tolerance_m))
+        centers, radii = _cover_geom(model, geom, tolerance_m)
         rotation = _rotation(np.asarray(model.geom_quat[geom], float))
         centers_body = np.asarray(model.geom_pos[geom], float) + centers @ rotation.T
         body = np.full(len(radii), model.geom_bodyid[geom])
@@ -106,9 +105,14 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
         Centers, (..., S, 3) float32, m, world. Differentiable.
 
     Raises:
-        ValueError: A shape of the poses is wrong, or there are fewer bodies than the spheres need.
+        ValueError: An argument is of a wrong kind, a shape of the poses is wrong, or there are
+            fewer bodies than the spheres need.
     """
-    xpos, xmat = jnp.asarray(data.xpos, jnp.float32), jnp.asarray(data.xmat, jnp.float32)
+    _check_spheres(spheres)
+    if not (hasattr(data, "xpos") and hasattr(data, "xmat")):
+        raise ValueError(f"data is {type(data).__name__}, expected bodies' poses xpos and xmat")
+    xpos = jnp.asarray(as_array("data.xpos", data.xpos))
+    xmat = jnp.asarray(as_array("data.xmat", data.xmat))
     if xpos.ndim < 2 or xpos.shape[-1] != 3:
         raise ValueError(f"data.xpos has shape {xpos.shape}, expected (..., B, 3)")
     if xmat.shape not in ((*xpos.shape, 3), (*xpos.shape[:-1], 9)):
@@ -157,6 +161,13 @@ def robot_clearance(
     """
     centers_world = place_spheres(spheres, data)
     return least(sphere_clearance(field, centers_world, spheres.radii, unknown))
+
+
+def _check_spheres(spheres: Any) -> None:
+    if not isinstance(spheres, RobotSpheres):
+        raise ValueError(
+            f"spheres is {type(spheres).__name__}, expected RobotSpheres from spheres_from_model"
+        )
 
 
 def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:

@@ -1,0 +1,135 @@
+"""The one way in for numbers: they become float32, or a ValueError names the argument.
+
+Numbers of any real type come in, in any byte order. Strings, booleans, complex numbers, times and
+Python objects, among them whole numbers beyond 64 bits, do not.
+"""
+
+from __future__ import annotations
+
+import numbers
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+
+def as_real(name: str, values: Any) -> np.ndarray:
+    """Checks that an argument is an array of real numbers.
+
+    Args:
+        name: What messages call the argument.
+        values: Concrete numbers in an array, or what numpy makes one of.
+
+    Returns:
+        The numbers in their own type, not copied; masked elements are NaN.
+
+    Raises:
+        ValueError: The values are traced, or no real numbers.
+    """
+    if is_traced(values):
+        raise ValueError(f"{name} is traced, expected concrete numbers, as outside jit")
+    try:
+        array = np.ma.asanyarray(values) if _has_mask(values) else np.asarray(values)
+    except Exception as error:  # rows of different lengths, or whatever a foreign object raises
+        raise ValueError(f"{name} is no array of numbers: {error}") from error
+    _check_type(name, array)
+    if not np.ma.isMaskedArray(array):
+        return array
+    if array.dtype.kind in "iu":  # whole numbers have no NaN
+        array = array.astype(np.float64)
+    return np.ma.filled(array, np.nan)
+
+
+def as_floats(name: str, values: Any) -> np.ndarray:
+    """Converts an argument to float32. Masked elements become NaN, those too large inf.
+
+    Args:
+        name: What messages call the argument.
+        values: Concrete numbers in an array, or what numpy makes one of.
+
+    Returns:
+        The array; not a copy if it is float32 already.
+
+    Raises:
+        ValueError: The values are traced, or no real numbers.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return as_real(name, values).astype(np.float32, copy=False)
+
+
+def as_array(name: str, values: Any) -> np.ndarray | jax.Array:
+    """Converts an argument that may be traced, or lie on a device, to float32.
+
+    Args:
+        name: What messages call the argument.
+        values: Numbers, as for `as_floats`, or arrays of JAX, also in lists.
+
+    Returns:
+        An array of JAX if one came, otherwise as from `as_floats`. Nothing waits for a device.
+
+    Raises:
+        ValueError: The values are no real numbers.
+    """
+    if not any(isinstance(leaf, jax.Array) for leaf in _leaves(values)):
+        return as_floats(name, values)
+    try:
+        array = values if isinstance(values, jax.Array) else jnp.asarray(values)
+        _check_type(name, array)
+        return array.astype(jnp.float32)
+    except (TypeError, RuntimeError) as error:  # unequal shapes; memory that was donated
+        raise ValueError(f"{name} is no array of numbers: {error}") from error
+
+
+def as_number(name: str, value: Any, least: float | None = None, *, above: bool = False) -> float:
+    """Checks one finite number.
+
+    Args:
+        name: What messages call the argument.
+        value: The number, not traced.
+        least: Its least value.
+        above: The number must be larger than `least`.
+
+    Returns:
+        The number.
+
+    Raises:
+        ValueError: It is something else, or less.
+    """
+    array = as_real(name, value)
+    limit = -np.inf if least is None else least
+    if array.shape == ():
+        number = float(array)
+        if np.isfinite(number) and (number > limit if above else number >= limit):
+            return number
+    bound = "a number" if least is None else f"{'>' if above else '>='} {least:g}"
+    raise ValueError(f"{name} is {value!r}, expected {bound} and finite")
+
+
+def check_whole(name: str, value: Any, least: int) -> None:
+    """Raises a ValueError if a count that shapes or loops depend on is no whole number >= least."""
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} is {value!r}, expected a whole number >= {least}")
+
+
+def is_traced(*values: Any) -> bool:
+    """Returns whether some values, or members of their lists and tuples, are traced by JAX."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in _leaves(values))
+
+
+def _leaves(values: Any) -> list[Any]:
+    """The members of nested lists and tuples."""
+    return jax.tree.leaves(values, is_leaf=lambda value: not isinstance(value, list | tuple))
+
+
+def _has_mask(values: Any) -> bool:
+    inner = values if isinstance(values, list | tuple) else ()
+    return any(np.ma.isMaskedArray(each) for each in (values, *inner))
+
+
+def _check_type(name: str, array: Any) -> None:
+    dtype = array.dtype
+    real = jnp.issubdtype(dtype, np.floating) or jnp.issubdtype(dtype, np.integer)
+    if not real or dtype.kind == "m":  # numpy counts spans of time among the integers
+        raise ValueError(f"{name} has dtype {dtype}, expected real numbers")
