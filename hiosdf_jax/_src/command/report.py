@@ -13,6 +13,7 @@ import numpy as np
 
 from hiosdf_jax._src.command.map_frames import Mapped
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.scoring import table
 from hiosdf_jax._src.state import Flag
 
@@ -97,7 +98,9 @@ def write_json(path: Path, value: Any) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    path.write_text(json.dumps(to_json(value), indent=2) + "\n", "utf-8")
+    text = json.dumps(to_json(value), indent=2) + "\n"
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def to_json(value: Any) -> Any:
