@@ -44,11 +44,11 @@ def describe(mapped: Mapped, config: Config) -> dict[str, Any]:
         "updates": int(mapped.state.updates),
         "frames_skipped": mapped.skipped,
         "stopped_by": None if mapped.stopped is None else str(mapped.stopped),
-        "compile_s": float(mapped.update_seconds[0]),
+        "compile_s": float(mapped.update_seconds[0]) if len(mapped.update_seconds) else math.nan,
         "update_median_ms": float(np.median(later_ms)) if len(later_ms) else math.nan,
         "update_p90_ms": float(np.percentile(later_ms, 90)) if len(later_ms) else math.nan,
-        "points_used": mapped.points_used,
-        "points_outside": mapped.points_outside,
+        "points_used": mapped.progress.points_used,
+        "points_outside": mapped.progress.points_outside,
         "flags": [str(flag.name) for flag in Flag if flags & flag],
         "config": dataclasses.asdict(config),
         "device": jax.devices()[0].device_kind,
@@ -64,12 +64,13 @@ def summarize(metrics: dict[str, Any]) -> str:
     Returns:
         Several lines.
     """
-    lines = [
-        f"{metrics['updates']} updates on {metrics['device']}: "
-        f"first {metrics['compile_s']:.1f} s (it compiles), then "
-        f"{metrics['update_median_ms']:.0f} ms (median), "
-        f"{metrics['update_p90_ms']:.0f} ms (90 % below)"
+    times = [
+        f"first {metrics['compile_s']:.1f} s (it compiles)",
+        f"then {metrics['update_median_ms']:.0f} ms (median)",
+        f"{metrics['update_p90_ms']:.0f} ms (90 % below)",
     ]
+    measured = [each for each in times if "nan" not in each] or ["none of them in this run"]
+    lines = [f"{metrics['updates']} updates on {metrics['device']}: {', '.join(measured)}"]
     if metrics["frames_skipped"]:
         lines.append(f"{metrics['frames_skipped']} frames could not be used and were skipped")
     if metrics["stopped_by"]:
