@@ -86,7 +86,8 @@ def replacing_together(folder: _Path, names: Sequence[str]) -> Iterator[Path]:
     with _naming(folder, folder):
         aside, held = _make_folder_aside(folder)
     try:
-        yield aside
+        with _naming_instead(aside, folder):
+            yield aside
         targets = {name: _target(folder / name) for name in names}
         for name, target in targets.items():
             if (aside / name).exists():
@@ -262,6 +263,17 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _naming_instead(aside: Path, folder: Path) -> Iterator[None]:
+    """Puts the files of a folder into errors that name those aside."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error.filename, str) and Path(error.filename).is_relative_to(aside):
+            error.filename = str(folder / Path(error.filename).relative_to(aside))
+        raise
 
 
 @contextlib.contextmanager
