@@ -16,6 +16,8 @@ from hiosdf_jax._src.command.stopping import Stopping
 
 FRAMES = 20  # frame 15 is held out
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+_shuffled = np.random.default_rng(0).permutation(FRAMES).tolist()
+QUICK, LONG = _shuffled[:4], [pytest.param(i, marks=pytest.mark.long) for i in _shuffled[4:]]
 RESULTS = {"metrics.json", "slices.png", "mesh.ply", "mesh.png"}
 
 
@@ -71,7 +73,7 @@ def check_equal(path, recording):
 
 
 @pytest.mark.parametrize("number", CODES)
-@pytest.mark.parametrize("frame", np.random.default_rng(0).permutation(FRAMES)[:4].tolist())
+@pytest.mark.parametrize("frame", [*QUICK, *LONG])
 def test_a_stopped_run_goes_on(tmp_path, capsys, monkeypatch, quick, recording, number, frame):
     output, saved = tmp_path / "out", tmp_path / "map.npz"
     arguments = ["map", str(recording[0]), "--output", str(output), "--save", str(saved), *BOX]

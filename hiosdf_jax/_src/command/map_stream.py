@@ -116,7 +116,7 @@ def run_stream(
         returns_world = mapped.held_out_world
         scores["held_out"] = held_out.score_held_out(queries.sdf, queries.observed, returns_world)
     return_freed_memory()
-    print("drawing slices.png, mesh.ply and mesh.png")
+    print("drawing slices.png, mesh.ply and mesh.png", flush=True)
     described: dict[str, Any] = {}
     with replacing_together(output, RESULTS) as folder:
         up_world = drawing.draw_map(folder, queries, exact_sdf, mapped.path_world, mapped.up_world)
