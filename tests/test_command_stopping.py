@@ -111,12 +111,17 @@ def test_a_run_that_is_stopped_twice_without_a_file_of_its_own(
         assert {path.name for path in output.iterdir()} == RESULTS | {"checkpoint.npz"}
         assert int(hio.load(output / "checkpoint.npz").updates) == frame + 1
         arguments = again[1:]
+    assert cli.main(arguments) == 0
+    assert {path.name for path in output.iterdir()} == RESULTS
+    with monkeypatch.context() as patch:
+        interrupt(patch, 9, lambda: signal.raise_signal(signal.SIGINT))
+        assert cli.main([*arguments[: arguments.index("--resume")], *BOX]) == 130
     # The configuration is that of the map, without a first reading; the stream may have grown.
+    capsys.readouterr()
     longer = ["map", str(recording[0]), "--output", str(output), "--save", str(tmp_path / "map")]
     assert cli.main([*longer, "--resume", str(output / "checkpoint.npz")]) == 0
     check_equal(tmp_path / "map", recording)
     assert "finding bounds" not in capsys.readouterr().err
-    assert cli.main(arguments) == 0
     assert {path.name for path in output.iterdir()} == RESULTS
 
 

@@ -21,7 +21,7 @@ from tqdm import tqdm
 import hiosdf_jax as hio
 from benchmarks import records
 
-_HALF = np.array([1.57, 1.23, 1.06])  # m, the room; not on faces of voxels
+_HALF = np.array([0.97, 0.78, 0.56])  # m, the room; not on faces of voxels
 _NOISE = 0.01  # m
 _RAYS = 300
 _POINTS = 2000  # where the error is measured
@@ -49,10 +49,11 @@ def endure(updates: int, seed: int = 0) -> dict[str, float]:
         max_points=_RAYS,
         max_range=5.0,
         distance_horizon=1.0,
-        near_samples=800,
-        far_samples=800,
-        local_points=40,
-        hidden_width=32,
+        near_samples=400,
+        far_samples=400,
+        local_points=20,
+        hidden_width=16,
+        hidden_layers=1,
         batches=2,
     )
     state = hio.init(config, jax.random.key(seed))
@@ -84,7 +85,7 @@ def endure(updates: int, seed: int = 0) -> dict[str, float]:
 def _frame(i: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Noisy returns of a sensor on a closed walk, and its pose."""
     angle = 0.05 * i
-    position = [0.8 * np.cos(angle), 0.6 * np.sin(angle), 0.3 * np.sin(0.7 * angle)]
+    position = [0.4 * np.cos(angle), 0.3 * np.sin(angle), 0.2 * np.sin(0.7 * angle)]
     rays = rng.normal(size=(_RAYS, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     pose = np.eye(4)

@@ -130,8 +130,9 @@ def run_stream(
         raise lost[0]
     if mapped.stopped is not None:
         raise mapped.stopped
-    if save_path is None:
-        map_path.unlink(missing_ok=True)  # of this run or an older one; neither is unfinished now
+    unfinished = output / UNFINISHED  # of this run, or of one that it takes the place of
+    if map_path.resolve() != unfinished.resolve() or save_path is None:
+        unfinished.unlink(missing_ok=True)
     return described
 
 
