@@ -14,6 +14,7 @@ from room_files import BOX, use_room_config, write_points, write_range
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.command import cli, map_stream
+from hiosdf_jax._src.datasets import stream as stream_module
 
 RESULTS = ["mesh.ply", "mesh.png", "slices.png", "metrics.json"]
 
@@ -277,3 +278,12 @@ def test_a_closed_standard_output_is_noticed_before_the_mapping(tmp_path, redire
     assert result.stderr == f"hiosdf: {message}\n"
     assert (tmp_path / "code").read_text() == "2\n"
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("far", [np.nan, np.inf])
+def test_bounds_that_cannot_be_found(tmp_path, capsys, monkeypatch, far):
+    extent = stream_module.Extent(((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), far)
+    monkeypatch.setattr(stream_module, "find_bounds", lambda *_, **__: extent)
+    stream = str(write_range(tmp_path / "stream.npz", 2))
+    assert cli.main(["map", stream, "--output", str(tmp_path / "out")]) == 2
+    assert one_line(capsys).startswith("the returns are too far to find bounds, expected --bounds")

@@ -330,6 +330,10 @@ def _complete(bounds: Any, options: argparse.Namespace, stream: Stream) -> tuple
         lambda: find_bounds(stream, skip_bad_frames=options.skip_bad_frames), code=_NOTHING_MAPPED
     )
     bounds = bounds or extent.bounds
+    if not math.isfinite(sum(map(sum, bounds)) + extent.max_range):
+        raise _Failure(
+            "the returns are too far to find bounds, expected --bounds and --max-range", _BAD_INPUT
+        )
     max_range = options.max_range or math.ceil(10 * extent.max_range) / 10
     (x0, y0, z0), (x1, y1, z1) = bounds
     print(
