@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.command.report import to_json
+from hiosdf_jax._src.output_files import replacing
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -55,7 +56,9 @@ def write(path: Path, value: Any) -> None:
         value: Dicts, lists, strings and numbers. Numbers that are not finite become null.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(_lay_out(to_json(value), "") + "\n", "utf-8")
+    text = _lay_out(to_json(value), "") + "\n"
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def rounded(value: float, digits: int = 6) -> float:

@@ -67,5 +67,5 @@ def test_a_refused_frame_adds_no_points():
             [(near, pose), (near + 30, pose), (near, pose)], CONFIG, jax.random.key(0)
         )
     assert int(mapped.state.updates) == 2
-    assert (mapped.points_used, mapped.points_outside) == (500, 0)
+    assert (mapped.progress.points_used, mapped.progress.points_outside) == (500, 0)
     assert "flag OUT_OF_RANGE" in report.summarize(report.describe(mapped, CONFIG))

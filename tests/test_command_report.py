@@ -12,6 +12,7 @@ from room import CONFIG
 import hiosdf_jax as hio
 from hiosdf_jax._src.command import report
 from hiosdf_jax._src.command.map_frames import Mapped
+from hiosdf_jax._src.command.progress import Progress
 from hiosdf_jax.datasets import BadFrameError
 
 
@@ -29,8 +30,7 @@ def mapped():
         skipped=2,
         stopped=BadFrameError("frame 6: no pose"),
         held_out_world=np.zeros((0, 3)),
-        points_used=2400,
-        points_outside=4,
+        progress=Progress(next_frame=6, points_used=2400, points_outside=4),
     )
 
 

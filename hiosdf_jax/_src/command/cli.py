@@ -5,22 +5,31 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hiosdf_jax._src.command.console import LastingText, lasting
+from hiosdf_jax._src.command.stopping import Stopping
+from hiosdf_jax._src.output_files import check_output, check_output_folder, replacing_together
+
 # Heavy imports are inside the functions, so that `hiosdf --help` responds at once.
 if TYPE_CHECKING:
     import numpy as np
 
+    from hiosdf_jax._src.command.progress import SavedMap
     from hiosdf_jax._src.config import Config
     from hiosdf_jax._src.datasets.stream import Stream
     from hiosdf_jax._src.datasets.truth import GroundTruth
 
 _NOTHING_MAPPED, _NOT_REACHED, _BAD_INPUT = 1, 1, 2  # exit codes; argparse itself exits with 2
 _OUTPUT = Path("hiosdf_output")
-_DEMO_FRAMES = 80
+_DEMO_FRAMES, _MOST_DEMO_FRAMES = 80, 100_000
+_MOST_SEED = 2**32 - 1  # JAX drops higher bits
+_PLAN_RESULTS = ("plan.png", "plan.gif", "metrics.json")
 _SKIP_HINT = " (--skip-bad-frames skips such frames)"
 
 _EXAMPLES = """\
@@ -37,7 +46,8 @@ examples:
   hiosdf demo --plan --seed 3           a robot drives from one room to another
 
 The folder gets metrics.json, slices.png, mesh.ply and mesh.png; with --plan it gets metrics.json,
-plan.png and plan.gif.
+plan.png and plan.gif. Ctrl-C ends the mapping as it does with hiosdf map; with --plan it ends the
+run at once, and nothing is written.
 """
 _MAP_EXAMPLES = """\
 examples:
@@ -51,13 +61,18 @@ examples:
       a folder of .ply or .pcd clouds; given both, bounds and range need no first reading
   hiosdf map stream.npz --ground-truth house.ply
       score the map against a mesh of the scene
+  hiosdf map drive/ --save map.npz --checkpoint-every 100
+  hiosdf map drive/ --save map.npz --resume map.npz
+      write the map after every 100 updates, and go on with it after a stop or a crash
 
 The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
 every tenth frame, which it is not given.
 
-A bad frame ends the mapping with exit code 2; the map of the frames before it is still scored,
-drawn and written.
+A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C) and SIGTERM end it after the current
+frame with exit code 130 and 143; a second one ends it at once. In each case the map so far is
+scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on with
+it.
 """
 
 
@@ -77,46 +92,97 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, 1 if no frame could be mapped or the robot did not reach its goal, 2 if a
-        file, a frame or a value is not as expected.
+        file, a frame or a value is not as expected, 128 plus its number if a signal ended the run.
 
     Raises:
         SystemExit: An argument is unknown or malformed, or help was requested.
     """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(arguments)
-    try:
-        options.command(options)
-    except _Failure as failure:
-        print(f"hiosdf: {failure}", file=sys.stderr)
-        return failure.code
-    return 0
+    options.arguments = arguments
+    # The one place where a command fails.
+    with lasting() as out, Stopping() as stopping:
+        options.stopping = stopping
+        try:
+            _check_console(out)
+            _check_numbers(options)
+            options.command(options)
+            _check_console(out)
+        except _Failure as failure:
+            print(f"hiosdf: {failure}", file=sys.stderr)
+            return failure.code
+        except (OSError, MemoryError) as error:
+            print(f"hiosdf: {_message(error) or 'out of memory'}", file=sys.stderr)
+            return _BAD_INPUT
+        except KeyboardInterrupt:
+            print("hiosdf: stopped; nothing was written", file=sys.stderr)
+            return 128 + (stopping.received or signal.SIGINT)
+    return 0 if stopping.received is None else 128 + stopping.received
+
+
+def _check_console(out: Any) -> None:
+    """Raises a failure if standard output is closed, or its reader has gone."""
+    if out is None:
+        raise _Failure("standard output is closed", _BAD_INPUT)
+    out.flush()
+    if isinstance(out, LastingText) and out.failure is not None:
+        raise _Failure(f"standard output: {out.failure.strerror}", _BAD_INPUT)
+
+
+def _check_numbers(options: argparse.Namespace) -> None:
+    """Raises a failure for numbers too large to count with."""
+    most = {"seed": _MOST_SEED}
+    if options.command is _demo:
+        most["frames"] = _MOST_DEMO_FRAMES
+    for name, limit in most.items():
+        value = getattr(options, name)
+        if value is not None and value > limit:
+            raise _Failure(f"--{name} is {value}, expected at most {limit}", _BAD_INPUT)
+
+
+def _begin(text: str) -> None:
+    """Prints the first line of a run; fails, before any work, if nobody can read it."""
+    print(text)
+    _check_console(sys.stdout)
 
 
 def _demo(options: argparse.Namespace) -> None:
     if options.plan:
         _plan(options)
         return
+    output = options.output or _OUTPUT / "demo"
+    _check_outputs(options, output)
+    resumed = _resume(options)
     from hiosdf_jax._src.demo import apartment
     from hiosdf_jax._src.demo.primitives import signed_distance
 
     frames = options.frames or _DEMO_FRAMES
-    stream = apartment.ApartmentStream(frames=frames, seed=options.seed)
-    config = _configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)
-    print(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
+    seed = _seed(options, resumed)
+    stream = apartment.ApartmentStream(frames=frames, seed=seed)
+    if resumed is None:
+        config = _configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)
+    else:
+        config = resumed.state.config
+    _begin(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
     _run(
+        options,
         stream,
         config,
-        options.output or _OUTPUT / "demo",
+        output,
         name="demo",
-        seed=options.seed,
+        seed=seed,
         truth=apartment.sample_truth(stream),
         exact_sdf=lambda points_world: signed_distance(stream.model, points_world)[0],
+        resumed=resumed,
     )
 
 
 def _plan(options: argparse.Namespace) -> None:
-    for name in ("frames", "config"):
+    for name in ("frames", "config", "save", "checkpoint_every", "resume"):
         if getattr(options, name) is not None:
-            raise _Failure(f"--{name} cannot be combined with --plan", _BAD_INPUT)
+            raise _Failure(f"{_option(name)} cannot be combined with --plan", _BAD_INPUT)
+    output = options.output or _OUTPUT / "demo_plan"
+    _check_folder(options, output, _PLAN_RESULTS)
     try:
         from hiosdf_jax._src.demo import exploration, picture
     except ModuleNotFoundError as error:
@@ -125,15 +191,11 @@ def _plan(options: argparse.Namespace) -> None:
         hint = "--plan needs jax-mppi: in a clone, pip install '.[plan]'"
         raise _Failure(hint, _BAD_INPUT) from error
 
-    output = options.output or _OUTPUT / "demo_plan"
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        print("a robot explores an apartment that it does not know")
-        run = exploration.explore(options.seed)
-        print("drawing plan.png and plan.gif")
-        picture.write_run(output, run)
-    except OSError as error:
-        raise _Failure(_message(error), _BAD_INPUT) from error
+    _begin("a robot explores an apartment that it does not know")
+    run = exploration.explore(options.seed or 0)
+    print("drawing plan.png and plan.gif")
+    with replacing_together(output, _PLAN_RESULTS) as folder:
+        picture.write_run(folder, run)
     metrics = run.metrics
     print(
         f"from the {metrics['from']} to the {metrics['to']}: {metrics['path_m']:.1f} m in "
@@ -148,8 +210,9 @@ def _plan(options: argparse.Namespace) -> None:
 
 
 def _map(options: argparse.Namespace) -> None:
-    if options.save is not None and not options.save.parent.is_dir():
-        raise _Failure(f"{options.save.parent}: no such folder", _BAD_INPUT)
+    place = options.stream.absolute()
+    output = options.output or _OUTPUT / (place.name if place.is_dir() else place.stem)
+    _check_outputs(options, output)
     if options.ground_truth is not None and not options.ground_truth.exists():
         raise _Failure(f"{options.ground_truth}: No such file or folder", _BAD_INPUT)
     overrides = {"max_range": options.max_range, "voxel_size": options.voxel_size}
@@ -159,24 +222,85 @@ def _map(options: argparse.Namespace) -> None:
         bounds = (tuple(options.bounds[:3]), tuple(options.bounds[3:]))
     # Checked before minutes are spent on reading; the bounds may still be unknown.
     _configure(options.config, bounds or ((0, 0, 0), (10, 10, 10)), **overrides)
+    resumed = _resume(options)
     stream, truth = _open(options)
-    if bounds is None or options.max_range is None:
-        bounds, overrides["max_range"] = _complete(bounds, options, stream)
+    _begin(f"{place.name}: {len(stream)} frames")
+    if resumed is not None:
+        config = resumed.state.config
+    else:
+        if bounds is None or options.max_range is None:
+            bounds, overrides["max_range"] = _complete(bounds, options, stream)
+        config = _configure(options.config, bounds, **overrides)
     exact_sdf = None
     if options.ground_truth is not None:
-        truth, exact_sdf = _sample_truth(options.ground_truth, stream, overrides["max_range"])
-    place = options.stream.absolute()
+        truth, exact_sdf = _sample_truth(options.ground_truth, stream, config.max_range)
     _run(
+        options,
         stream,
-        _configure(options.config, bounds, **overrides),
-        options.output or _OUTPUT / (place.name if place.is_dir() else place.stem),
+        config,
+        output,
         name=place.name,
-        seed=options.seed,
+        seed=_seed(options, resumed),
         truth=truth,
         exact_sdf=exact_sdf,
-        save_path=options.save,
         skip_bad_frames=options.skip_bad_frames,
+        resumed=resumed,
     )
+
+
+def _check_outputs(options: argparse.Namespace, output: Path) -> None:
+    """Raises a failure for outputs that cannot be written, before any work."""
+    from hiosdf_jax._src.command.map_stream import RESULTS, UNFINISHED
+
+    _check_folder(options, output, (*RESULTS, UNFINISHED))
+    if options.save is None:
+        return
+    _checked(lambda: check_output(options.save))
+    inputs = [getattr(options, name, None) for name in ("stream", "ground_truth", "trajectory")]
+    for other in (*filter(None, inputs), *(output / name for name in RESULTS)):
+        if options.save.resolve() == other.resolve():
+            raise _Failure(f"--save {options.save} would replace {other}", _BAD_INPUT)
+
+
+def _check_folder(options: argparse.Namespace, output: Path, names: Sequence[str]) -> None:
+    """Raises a failure if results cannot go to a folder, or would become part of a recording."""
+    _checked(lambda: check_output_folder(output, names))
+    if not output.is_dir():
+        return
+    stream = getattr(options, "stream", None)
+    clouds = {each.name for each in output.iterdir() if each.suffix in (".ply", ".pcd")}
+    if clouds - {"mesh.ply"} or (stream and output.resolve() == stream.resolve()):
+        raise _Failure(f"{output}: holds a recording, expected a folder for results", _BAD_INPUT)
+
+
+def _resume(options: argparse.Namespace) -> SavedMap | None:
+    """The map to go on with; raises a failure if it contradicts the other options."""
+    if options.resume is None:
+        return None
+    from hiosdf_jax._src.command.progress import load_map
+    from hiosdf_jax._src.config import Config
+
+    resumed = _checked(lambda: load_map(options.resume))
+    config = resumed.state.config
+    sizes = {"voxel_size": config.voxel_size, "max_range": config.max_range}
+    known = {"seed": resumed.seed, "bounds": [*config.bounds[0], *config.bounds[1]]} | sizes
+    for name, value in known.items():
+        given = getattr(options, name, None)
+        if given is not None and given != value:
+            raise _Failure(
+                f"{_option(name)} is {given}, expected {value} as in {options.resume}", _BAD_INPUT
+            )
+    if options.config and getattr(Config, options.config)(config.bounds, **sizes) != config:
+        raise _Failure(f"--config is {options.config}, not that of {options.resume}", _BAD_INPUT)
+    return resumed
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _seed(options: argparse.Namespace, resumed: SavedMap | None) -> int:
+    return (options.seed or 0) if resumed is None else resumed.seed
 
 
 def _open(options: argparse.Namespace) -> tuple[Stream, GroundTruth | None]:
@@ -206,6 +330,10 @@ def _complete(bounds: Any, options: argparse.Namespace, stream: Stream) -> tuple
         lambda: find_bounds(stream, skip_bad_frames=options.skip_bad_frames), code=_NOTHING_MAPPED
     )
     bounds = bounds or extent.bounds
+    if not math.isfinite(sum(map(sum, bounds)) + extent.max_range):
+        raise _Failure(
+            "the returns are too far to find bounds, expected --bounds and --max-range", _BAD_INPUT
+        )
     max_range = options.max_range or math.ceil(10 * extent.max_range) / 10
     (x0, y0, z0), (x1, y1, z1) = bounds
     print(
@@ -237,19 +365,67 @@ def _configure(name: str | None, bounds: Any, **overrides: float) -> Config:
     return _checked(lambda: getattr(Config, name)(bounds, **overrides))
 
 
-def _run(stream: Stream, config: Config, output: Path, **settings: Any) -> None:
+def _run(
+    options: argparse.Namespace,
+    stream: Stream,
+    config: Config,
+    output: Path,
+    *,
+    truth: GroundTruth | None,
+    resumed: SavedMap | None,
+    **settings: Any,
+) -> None:
+    """Maps, scores and draws; turns what ends the mapping into a failure or a hint to go on."""
     from hiosdf_jax._src.command import map_stream
-    from hiosdf_jax._src.command.map_frames import NothingMappedError
+    from hiosdf_jax._src.command.map_frames import (
+        NothingMappedError,
+        OtherStreamError,
+        StoppedError,
+    )
     from hiosdf_jax._src.datasets.stream import BadFrameError
 
+    if truth is not None and not (truth.frame < len(stream)).any():
+        first = f"begin with frame {truth.frame.min()}" if len(truth.frame) else "are none"
+        raise _Failure(
+            f"the exact distances {first}, but the stream has {len(stream)} frames", _BAD_INPUT
+        )
+    if resumed is not None and resumed.held_out != (truth is None):
+        was = "without" if resumed.held_out else "with"
+        raise _Failure(f"{options.resume} was mapped {was} exact distances", _BAD_INPUT)
+    options.stopping.in_order()
     try:
-        map_stream.run_stream(stream, config, output, **settings)
+        map_stream.run_stream(
+            stream,
+            config,
+            output,
+            truth=truth,
+            resumed=resumed,
+            save_path=options.save,
+            checkpoint_every=options.checkpoint_every,
+            stop=lambda: options.stopping.received and options.stopping.received.name,
+            **settings,
+        )
     except BadFrameError as error:
         raise _Failure(f"{error}{_SKIP_HINT}", _BAD_INPUT) from error
     except NothingMappedError as error:
         raise _Failure(error, _NOTHING_MAPPED) from error
-    except OSError as error:
-        raise _Failure(_message(error), _BAD_INPUT) from error
+    except OtherStreamError as error:
+        raise _Failure(f"{options.resume}: {error}", _BAD_INPUT) from error
+    except StoppedError as stop:
+        if not stop.mapped:
+            raise KeyboardInterrupt from stop
+        map_path = str(map_stream.map_file(output, options.save))
+        again = shlex.join(["hiosdf", *_without_resume(options.arguments), "--resume", map_path])
+        print(f"stopped by {stop}; to go on:\n  {again}")
+
+
+def _without_resume(arguments: Sequence[str]) -> list[str]:
+    """The arguments without the option --resume and its value."""
+    kept = []
+    for argument, before in zip(arguments, ["", *arguments], strict=False):
+        if "--resume" not in (argument, before) and not argument.startswith("--resume="):
+            kept.append(argument)
+    return kept
 
 
 def _checked[Result](call: Callable[[], Result], code: int = _BAD_INPUT) -> Result:
@@ -286,8 +462,26 @@ def _parser() -> argparse.ArgumentParser:
         help="size of the map: light suits a CPU, default a GPU, paper has the paper's numbers "
         "(default: light on a CPU, default on a GPU)",
     )
+    common.add_argument("--seed", type=_whole(0), help="seed of all randomness (default: 0)")
     common.add_argument(
-        "--seed", type=_whole(0), default=0, help="seed of all randomness (default: %(default)s)"
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help='write the map, for hio.load("FILE") and --resume FILE',
+    )
+    common.add_argument(
+        "--checkpoint-every",
+        type=_whole(1),
+        metavar="N",
+        help="write the map after every N updates, too: to --save, or to checkpoint.npz in the "
+        "folder of the output",
+    )
+    common.add_argument(
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="go on with the map that a run of the same stream has written; its configuration, "
+        "bounds and seed are used",
     )
 
     demo = commands.add_parser(
@@ -334,7 +528,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="folder for metrics and pictures (default: hiosdf_output/STREAM)",
     )
-    map_.add_argument("--save", type=Path, metavar="FILE", help="write the map, for hio.load(FILE)")
     map_.add_argument("--frames", type=_whole(1), metavar="N", help="use only the first N frames")
     map_.add_argument(
         "--skip-bad-frames",

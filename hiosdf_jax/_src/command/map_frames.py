@@ -7,11 +7,12 @@ import ctypes
 import dataclasses
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
+from hiosdf_jax._src.command.progress import FrameDigest, Progress, SavedMap
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax._src.mapping import pipeline
@@ -23,6 +24,20 @@ class NothingMappedError(Exception):
     """No frame of a stream could be mapped."""
 
 
+class StoppedError(Exception):
+    """The mapping was stopped; the message says why and where.
+
+    Attributes:
+        mapped: Whether the run has a map to show.
+    """
+
+    mapped = True
+
+
+class OtherStreamError(ValueError):
+    """A map that is to go on was made from other frames."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Mapped:
     """The map of a stream, and how it was made.
@@ -31,13 +46,12 @@ class Mapped:
         state: The map after the last frame.
         path_world: (F, 3) m, the sensor's positions in the mapped frames.
         up_world: (3,) unit vector against gravity, estimated from the sensor's poses.
-        update_seconds: (F,) s, of each update until its result was ready.
+        update_seconds: (U,) s, of each update of this run until its result was ready.
         last_frame: Index of the last mapped frame.
         skipped: Number of bad frames that were skipped.
-        stopped: The bad frame that ended the mapping early, if any.
+        stopped: What ended the mapping early, if anything: a bad frame or a signal.
         held_out_world: (M, 3) float32 m, returns of the frames that the map was not given.
-        points_used: Number of fused points, over all frames.
-        points_outside: Number of points in range but outside the bounds, over all frames.
+        progress: How far the map has come in the stream.
     """
 
     state: MapState
@@ -46,10 +60,9 @@ class Mapped:
     update_seconds: np.ndarray
     last_frame: int
     skipped: int
-    stopped: BadFrameError | None
+    stopped: BadFrameError | StoppedError | None
     held_out_world: np.ndarray
-    points_used: int
-    points_outside: int
+    progress: Progress
 
 
 def fuse_frames(
@@ -59,16 +72,28 @@ def fuse_frames(
     *,
     held_out: Sequence[int] = (),
     skip_bad_frames: bool = False,
+    resumed: SavedMap | None = None,
+    keep: Callable[[MapState, Progress], None] | None = None,
+    keep_every: int | None = None,
+    stop: Callable[[], object] = lambda: None,
 ) -> Mapped:
     """Fuses the frames of a stream into a map, one by one, with a progress bar.
+
+    A run that goes on with a map reads the frames before once more, to recognize the stream and to
+    know the sensor's path, but does not fuse them again.
 
     Args:
         stream: The frames.
         config: The map's configuration.
-        key: Source of the map's randomness.
+        key: Source of the map's randomness; a map to go on with has its own.
         held_out: Indices of frames that the map is not given; the result has returns of theirs.
         skip_bad_frames: Report bad frames on stderr and continue. By default the first bad frame
             ends the mapping.
+        resumed: The map to go on with.
+        keep: Is given the map so far, and how far it has come.
+        keep_every: Number of updates after which `keep` is called again.
+        stop: Is asked before each frame. The mapping ends if it returns something true, whose `str`
+            is the reason.
 
     Returns:
         The map and how it was made.
@@ -76,31 +101,64 @@ def fuse_frames(
     Raises:
         BadFrameError: A frame is bad and nothing was mapped before it.
         NothingMappedError: No frame could be mapped.
+        OtherStreamError: The map to go on with was made from other frames.
+        StoppedError: The mapping was to end before anything was mapped.
     """
     from tqdm import tqdm
 
-    state = pipeline.init(config, key)
+    if resumed is None:
+        state, before = pipeline.init(config, key), Progress()
+    else:
+        state, before = resumed.state, resumed.progress
+    first, points_used, points_outside = (
+        before.next_frame,
+        before.points_used,
+        before.points_outside,
+    )
+    digest = FrameDigest()
     seconds, path_world, ups_world = [], [], []
     kept_world, kept_rng = [np.empty((0, 3), np.float32)], np.random.default_rng(0)
-    points_used = points_outside = skipped = last_frame = 0
+    skipped = last_frame = 0
     stopped = None
+
+    def progress(next_frame: int) -> Progress:
+        return Progress(next_frame, digest.text(), points_used, points_outside)
+
+    def check_frames_before(next_frame: int) -> None:
+        if next_frame == first > 0 and digest.text() != before.digest:
+            raise OtherStreamError(
+                f"the map was made from other frames than the first {first} of this stream"
+            )
+
+    if first > len(stream):
+        raise OtherStreamError(
+            f"the map was made from {first} frames, but the stream has only {len(stream)}"
+        )
     bar = tqdm(range(len(stream)), desc="mapping", unit="frame")
     for i in bar:
+        check_frames_before(i)
+        if reason := stop():
+            stopped = StoppedError(f"{reason} after {i} of {len(stream)} frames")
+            break
         try:
             cloud, pose = read_frame(stream, i)
         except BadFrameError as error:
             if not skip_bad_frames:
                 stopped = error
                 break
+            digest.add(None, None)
             skipped += 1
             tqdm.write(str(error), file=sys.stderr)
             continue
+        digest.add(cloud, pose)
         if i in held_out:
             kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
             continue
         last_frame = i
         path_world.append(pose[:3, 3])
         ups_world.append(_up_of_frame(cloud, pose))
+        if i < first:
+            continue
         updates = int(state.updates)
         start = time.perf_counter()
         state = jax.block_until_ready(pipeline.update(state, cloud, pose))
@@ -110,13 +168,20 @@ def fuse_frames(
         if int(state.updates) > updates:  # a refused cloud leaves the numbers of the one before it
             points_used += int(state.report.points_used)
             points_outside += int(state.report.points_outside)
+        if keep is not None and keep_every and len(seconds) % keep_every == 0:
+            keep(state, progress(i + 1))
         if i % 5 == 0:
             loss_cm = 100 * float(state.report.sdf_loss)
             bar.set_postfix_str(
                 f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points", refresh=False
             )
+    else:
+        i = len(stream)
+        check_frames_before(i)
     bar.close()
-    if not seconds:
+    if not path_world or i < first:  # what was read again is no result of this run
+        if isinstance(stopped, StoppedError):
+            stopped.mapped = False
         raise stopped or NothingMappedError(
             f"none of the {len(stream) - len(held_out)} frames could be mapped, "
             "expected at least one"
@@ -132,8 +197,7 @@ def fuse_frames(
         skipped=skipped,
         stopped=stopped,
         held_out_world=np.concatenate(kept_world),
-        points_used=points_used,
-        points_outside=points_outside,
+        progress=progress(i),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from hiosdf_jax._src.command.map_frames import Mapped
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.scoring import table
 from hiosdf_jax._src.state import Flag
 
@@ -43,11 +44,11 @@ def describe(mapped: Mapped, config: Config) -> dict[str, Any]:
         "updates": int(mapped.state.updates),
         "frames_skipped": mapped.skipped,
         "stopped_by": None if mapped.stopped is None else str(mapped.stopped),
-        "compile_s": float(mapped.update_seconds[0]),
+        "compile_s": float(mapped.update_seconds[0]) if len(mapped.update_seconds) else math.nan,
         "update_median_ms": float(np.median(later_ms)) if len(later_ms) else math.nan,
         "update_p90_ms": float(np.percentile(later_ms, 90)) if len(later_ms) else math.nan,
-        "points_used": mapped.points_used,
-        "points_outside": mapped.points_outside,
+        "points_used": mapped.progress.points_used,
+        "points_outside": mapped.progress.points_outside,
         "flags": [str(flag.name) for flag in Flag if flags & flag],
         "config": dataclasses.asdict(config),
         "device": jax.devices()[0].device_kind,
@@ -63,12 +64,13 @@ def summarize(metrics: dict[str, Any]) -> str:
     Returns:
         Several lines.
     """
-    lines = [
-        f"{metrics['updates']} updates on {metrics['device']}: "
-        f"first {metrics['compile_s']:.1f} s (it compiles), then "
-        f"{metrics['update_median_ms']:.0f} ms (median), "
-        f"{metrics['update_p90_ms']:.0f} ms (90 % below)"
+    times = [
+        f"first {metrics['compile_s']:.1f} s (it compiles)",
+        f"then {metrics['update_median_ms']:.0f} ms (median)",
+        f"{metrics['update_p90_ms']:.0f} ms (90 % below)",
     ]
+    measured = [each for each in times if "nan" not in each] or ["none of them in this run"]
+    lines = [f"{metrics['updates']} updates on {metrics['device']}: {', '.join(measured)}"]
     if metrics["frames_skipped"]:
         lines.append(f"{metrics['frames_skipped']} frames could not be used and were skipped")
     if metrics["stopped_by"]:
@@ -97,7 +99,9 @@ def write_json(path: Path, value: Any) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    path.write_text(json.dumps(to_json(value), indent=2) + "\n", "utf-8")
+    text = json.dumps(to_json(value), indent=2) + "\n"
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def to_json(value: Any) -> Any:

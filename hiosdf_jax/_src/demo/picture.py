@@ -11,6 +11,7 @@ import numpy as np
 
 from hiosdf_jax._src.demo.apartment import BOUNDS_WORLD
 from hiosdf_jax._src.demo.exploration import ROBOT, Moment, Run
+from hiosdf_jax._src.output_files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,9 +32,10 @@ def write_run(folder: Path, run: Run) -> None:
     Raises:
         OSError: A file cannot be written.
     """
-    (folder / "metrics.json").write_text(json.dumps(run.metrics, indent=2) + "\n", "utf-8")
     save_picture(folder / "plan.png", run)
     save_animation(folder / "plan.gif", run)
+    with replacing(folder / "metrics.json") as file:
+        file.write((json.dumps(run.metrics, indent=2) + "\n").encode())
 
 
 def save_picture(path: str | os.PathLike[str], run: Run) -> None:
@@ -65,7 +67,8 @@ def save_picture(path: str | os.PathLike[str], run: Run) -> None:
         fontsize=10,
     )
     _draw_clearance(rows[1].subplots(), run)
-    figure.savefig(path, dpi=80)
+    with replacing(path) as file:
+        figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=80)
 
 
 def save_animation(path: str | os.PathLike[str], run: Run) -> None:
@@ -101,7 +104,9 @@ def save_animation(path: str | os.PathLike[str], run: Run) -> None:
         # An octree keeps the few pixels of goal and path red; a median cut does not.
         frames.append(pixels.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
     durations = [_GIF_FRAME_MS] * (len(frames) - 1) + [_GIF_LAST_MS]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    animation = {"save_all": True, "append_images": frames[1:], "duration": durations, "loop": 0}
+    with replacing(path) as file:
+        frames[0].save(file, format="GIF", **animation)
 
 
 def _draw_moment(ax: Axes, run: Run, moment: Moment) -> Any:

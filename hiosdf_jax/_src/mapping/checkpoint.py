@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import json
 import os
-import uuid
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,6 +16,7 @@ from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.mapping.pipeline import init
+from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.state import Grid, MapState, Side, check_map
 
 _FORMAT = "hiosdf_jax map"
@@ -65,7 +63,8 @@ _LIMITS = {
 def save(path: str | os.PathLike[str], state: MapState) -> None:
     """Writes the whole map to one compressed .npz file, without pickle.
 
-    The file is written under a temporary name and renamed, so that a crash keeps the old file.
+    The file is replaced when all of it is on the disk, so that a crash keeps the old file. The
+    rights of an old file are kept. A link stays, and the file that it leads to is replaced.
 
     Args:
         path: The file; its folder must exist.
@@ -74,32 +73,54 @@ def save(path: str | os.PathLike[str], state: MapState) -> None:
     Raises:
         ValueError: `state` is not a map.
         FileNotFoundError: There is no such folder.
+        OSError: The file cannot be written: it is read-only or a folder, or the disk is full.
 
     Example:
         >>> hio.save("house.npz", state)
     """
+    save_with_progress(path, state, None)
+
+
+def save_with_progress(
+    path: str | os.PathLike[str], state: MapState, progress: dict[str, Any] | None
+) -> None:
+    """Writes a map as `save` does, with notes on how far it has come in its stream.
+
+    Args:
+        path: The file; its folder must exist.
+        state: The map.
+        progress: Names and values that JSON can hold, for `read_progress`; None for no notes.
+
+    Raises:
+        ValueError: `state` is not a map.
+        OSError: As for `save`.
+    """
     check_map(state)
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, "no such folder", str(path.parent))
     header = {
         "format": _FORMAT,
         "version": _VERSION,
         "config": dataclasses.asdict(state.config),
         "key": str(jax.random.key_impl(state.key)),
     }
+    if progress is not None:
+        header["progress"] = progress  # `load` ignores it
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(_without_key(state)).items()}
     arrays["header"] = np.asarray(json.dumps(header))
-    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
-    try:
-        with aside.open("xb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        raise
+    with replacing(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def read_progress(path: str | os.PathLike[str]) -> Any:
+    """Reads the notes of `save_with_progress`.
+
+    Args:
+        path: A file that `load` has read.
+
+    Returns:
+        The notes as they are in the file; None if it has none.
+    """
+    with Archive(path) as archive:
+        return json.loads(str(archive.read("header"))).get("progress")
 
 
 def load(path: str | os.PathLike[str]) -> MapState:

@@ -10,6 +10,7 @@ import numpy as np
 
 from hiosdf_jax._src.field import mesh
 from hiosdf_jax._src.field.compiled import CompiledQueries
+from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.view.shading import save_shaded
 from hiosdf_jax._src.view.slices import save_slices
 
@@ -132,8 +133,7 @@ def _write_mesh(folder: Path, surface: trimesh.Trimesh, up_world: np.ndarray) ->
     model, picture = folder / "mesh.ply", folder / "mesh.png"
     if not len(surface.faces):
         print("the map shows no surface: no mesh.ply, no mesh.png")
-        for path in (model, picture):  # of an earlier run
-            path.unlink(missing_ok=True)
         return
-    surface.export(model)
+    with replacing(model) as file:
+        surface.export(file, file_type="ply")
     save_shaded(picture, surface, up_world=up_world.tolist())

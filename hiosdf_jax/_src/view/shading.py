@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from hiosdf_jax._src.output_files import replacing
 
 if TYPE_CHECKING:
     import trimesh
@@ -59,6 +62,7 @@ def save_shaded(
     Raises:
         ValueError: The mesh has no faces, size is not two positive numbers, or up_world is not a
             finite (3,) vector other than zero.
+        OSError: The picture cannot be written.
     """
     import matplotlib.image
 
@@ -70,7 +74,9 @@ def save_shaded(
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise ValueError(f"up_world = {up_world}, expected 3 finite numbers, not all 0")
     up = up / np.linalg.norm(up)
-    matplotlib.image.imsave(path, _shade(mesh, size, up))
+    picture = _shade(mesh, size, up)
+    with replacing(path) as file:
+        matplotlib.image.imsave(file, picture, format=Path(path).suffix[1:] or "png")
 
 
 def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.ndarray:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
+from hiosdf_jax._src.output_files import replacing
 
 _COLUMNS = 400  # samples along the longer side of a slice
 _CHUNK = 16384  # points per query; one shape, so that a jitted map compiles once
@@ -50,6 +52,7 @@ def save_slices(
     Raises:
         ValueError: There are no heights, bounds is not (2, 3) with a positive size in x and y, or a
             callable returned the wrong shape.
+        OSError: The picture cannot be written.
     """
     from matplotlib.figure import (
         Figure,
@@ -121,7 +124,8 @@ def save_slices(
     notes += ["grey: not observed"] if observed is not None else []
     notes += ["green: path of the sensor, from the dot"] if path_world is not None else []
     figure.supxlabel("; ".join(notes), fontsize=9)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as file:
+        figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=110)
 
 
 def _axes(box: np.ndarray) -> list[np.ndarray]:

@@ -1,0 +1,71 @@
+"""Standard output and standard error whose loss does not end a run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO
+
+
+class LastingText:
+    """A text stream that notes a failure to write and goes on without writing.
+
+    Attributes:
+        failure: The first failure, or None.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        """Wraps a stream."""
+        self.failure: OSError | None = None
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Writes, unless that has failed before."""
+        if self.failure is None:
+            try:
+                return self._stream.write(text)
+            except OSError as error:
+                self.failure = error
+        return len(text)
+
+    def flush(self) -> None:
+        """Flushes, unless writing has failed before."""
+        if self.failure is None:
+            try:
+                self._stream.flush()
+            except OSError as error:
+                self.failure = error
+
+    def __getattr__(self, name: str) -> Any:
+        """Everything else is that of the stream."""
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def lasting() -> Iterator[LastingText | None]:
+    """Replaces `sys.stdout` and `sys.stderr` while a command runs.
+
+    Yields:
+        The new standard output; None if the process was started without one.
+    """
+    out = None if sys.stdout is None else LastingText(sys.stdout)
+    with contextlib.ExitStack() as stack:
+        errors = sys.stderr or stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+        error = LastingText(errors)
+        stack.enter_context(contextlib.redirect_stderr(error))  # pyright: ignore[reportArgumentType]
+        stack.enter_context(contextlib.redirect_stdout(out))  # pyright: ignore[reportArgumentType]
+        yield out
+        for each in filter(None, (out, error)):
+            each.flush()
+            if each.failure is not None:
+                _silence(each)
+
+
+def _silence(stream: LastingText) -> None:
+    """Lets what is left in the buffer vanish; Python would fail to write it when it ends."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
