@@ -123,17 +123,19 @@ def _by_kernel(
     from hiosdf_jax._src.network import hopper_kernel  # needs a jax with GPU kernels
 
     layers = forward.layers_of(params)
-    (first, _), *hidden, (last, last_bias) = layers
-    biases = frequency * jnp.stack([bias for _, bias in layers[:-1]])
-    table = jnp.concatenate([frequency * first, biases, last.T])
-    kernels = [(frequency * kernel).astype(jnp.float16) for kernel, _ in hidden]
-    transposes = [kernel.T for kernel in kernels[::-1]] if with_gradient else []
+    (first, first_bias), *hidden, (last, last_bias) = layers
+    kernels, biases = (jnp.stack(parts) for parts in zip(*hidden, strict=True))
+    weights = (frequency * kernels).astype(jnp.float16)
+    if with_gradient:
+        weights = jnp.concatenate([weights, weights.transpose(0, 2, 1)[::-1]])
     rows = points.reshape(-1, 3)
     count = rows.shape[0]
     value, gradient = hopper_kernel.evaluate(
-        table,
-        jnp.concatenate(kernels + transposes),
         jnp.pad(rows, ((0, -count % hopper_kernel.TILE), (0, 0))),
+        frequency * jnp.concatenate([first, first_bias[None]]),
+        weights.reshape(-1, weights.shape[-1]),
+        frequency * biases,
+        last[:, 0],
         with_gradient=with_gradient,
         multiprocessors=_multiprocessors(),
         interpret=_INTERPRET,

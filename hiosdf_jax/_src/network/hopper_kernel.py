@@ -37,9 +37,11 @@ _COMPUTING_REGISTERS, _STREAMING_REGISTERS = 240, 24
 
 
 def evaluate(
-    table: jax.Array,
-    weights: jax.Array,
     points: jax.Array,
+    first: jax.Array,
+    weights: jax.Array,
+    biases: jax.Array,
+    output: jax.Array,
     *,
     with_gradient: bool,
     multiprocessors: int,
@@ -48,11 +50,12 @@ def evaluate(
     """Evaluates a SIREN whose weights and biases are already multiplied by omega_0.
 
     Args:
-        table: (L + 5, D) float32: the first layer's three rows of weights, the biases of all L + 1
-            sine layers, and the output's weights.
+        points: (N, 3) float32, N a multiple of `TILE`.
+        first: (4, D) float32: the input layer's three rows of weights and its bias.
         weights: Hidden layers as (K, D) float16, in the order of their use: L kernels (D, D), and
             with a gradient their transposes in reverse order.
-        points: (N, 3) float32, N a multiple of `TILE`.
+        biases: (L, D) float32, of the hidden layers.
+        output: (D,) float32, the output's weights.
         with_gradient: Whether to compute the gradient too.
         multiprocessors: Number of the device's multiprocessors.
         interpret: Pallas's parameters to interpret the kernel on a CPU.
@@ -61,34 +64,35 @@ def evaluate(
         The values without the output's bias, (N,), and the gradients by coordinate, (3, N). Without
         a gradient the second is undefined.
     """
-    width, layers, count = table.shape[1], table.shape[0] - 5, points.shape[0]
+    (layers, width), count = biases.shape, points.shape[0]
     blocks = width // _COLUMNS
     tiles = count // TILE
     grid = min(multiprocessors, tiles)
     steps = (2 if with_gradient else 1) * layers * blocks  # blocks of weights for each tile
     stages = _STAGES if steps % _STAGES == 0 else 2
-    bias, output = 3, layers + 4  # rows of the table
     waiting = layers - 2 if with_gradient else 0  # layers whose cosines wait in global memory
 
     def body(
         points_ref: Any,
-        table_ref: Any,
+        first_ref: Any,
         weights_ref: Any,
+        biases_ref: Any,
+        output_ref: Any,
         value_ref: Any,
         gradient_ref: Any,
         waiting_ref: Any,
         scratch: Any,
     ) -> None:
-        streamed, shared, cosines, values, gradients = scratch[:5]
-        filled, free, loaded, returned = scratch[5:]
+        streamed, first_rows, bias_rows, output_row, values, gradients, cosines = scratch[:7]
+        filled, free, loaded, returned = scratch[7:]
         warpgroup, cell = lax.axis_index("warpgroup"), lax.axis_index("cell")
         turns = (tiles - cell + grid - 1) // grid
 
-        def row(index: int, block: int) -> jax.Array:
-            """A row's block of the table, for all points."""
-            place = shared.at[index, pl.ds(block * _COLUMNS, _COLUMNS)]
-            values = gpu.load(place, layout=_LAYOUT.reduce(0))
-            return lax.broadcast_in_dim(values, (_ROWS, _COLUMNS), [1])
+        def spread(row: Any, block: int) -> jax.Array:
+            """A block of a row, for all points."""
+            place = row.at[pl.ds(block * _COLUMNS, _COLUMNS)]
+            part = gpu.load(place, layout=_LAYOUT.reduce(0))
+            return lax.broadcast_in_dim(part, (_ROWS, _COLUMNS), [1])
 
         def compute_tile(turn: jax.Array, _: None) -> None:
             start = (turn * grid + cell) * TILE + warpgroup * _ROWS
@@ -99,44 +103,44 @@ def evaluate(
                 column = gpu.load(place, layout=_LAYOUT.reduce(1), optimized=False)
                 coordinates.append(lax.broadcast_in_dim(column, (_ROWS, _COLUMNS), [0]))
 
-            def first(block: int) -> jax.Array:
+            def first_angle(block: int) -> jax.Array:
                 # Meters need all of float32.
-                z = row(bias, block)
+                angle = spread(first_rows.at[3], block)
                 for axis in range(3):
-                    z = z + coordinates[axis] * row(axis, block)
-                return z
+                    angle = angle + coordinates[axis] * spread(first_rows.at[axis], block)
+                return angle
 
-            def product(x: list[jax.Array]) -> list[jax.Array]:
+            def product(x: list[jax.Array]) -> jax.Array:
                 """Multiplies (64, D), in blocks of columns, by the next (D, D) of weights."""
-                # With slots known to the compiler, the kernel is twice as fast; jax 0.11 needs them
-                # to look traced.
-                slots = [next(used) % stages + 0 * turn for _ in range(blocks)]
+                places = [next(used) % stages for _ in range(blocks)]
+
+                def slot(block: int) -> jax.Array:
+                    return places[block] + 0 * turn  # jax 0.11 needs it to look traced
 
                 def accumulate(total: Any) -> jax.Array:
-                    for block, slot in enumerate(slots):
-                        gpu.barrier_wait(filled.at[slot])
-                        gpu.wgmma(total, x[block], streamed.at[slot])
+                    for block in range(blocks):
+                        place = slot(block)
+                        gpu.barrier_wait(filled.at[place])
+                        gpu.wgmma(total, x[block], streamed.at[place])
                         if block > 0:
                             gpu.wgmma_wait(1)
-                            gpu.barrier_arrive(free.at[slots[block - 1]])
+                            gpu.barrier_arrive(free.at[slot(block - 1)])
                     result = total[...]
-                    gpu.barrier_arrive(free.at[slots[-1]])
+                    gpu.barrier_arrive(free.at[slot(blocks - 1)])
                     return result
 
-                def interpreted() -> jax.Array:  # which has no products with registers
-                    total = jnp.zeros((_ROWS, width), jnp.float32)
-                    for block, slot in enumerate(slots):
-                        gpu.barrier_wait(filled.at[slot])
-                        factor = streamed[slot]
-                        total += jnp.dot(x[block], factor, preferred_element_type=jnp.float32)
-                        gpu.barrier_arrive(free.at[slot])
-                    return total
-
                 if interpret is None:
-                    result = pl.run_scoped(accumulate, gpu.ACC((_ROWS, width), jnp.float32))
-                else:
-                    result = interpreted()
-                return [result[:, k * _COLUMNS : (k + 1) * _COLUMNS] for k in range(blocks)]
+                    return pl.run_scoped(accumulate, gpu.ACC((_ROWS, width), jnp.float32))
+                total = jnp.zeros((_ROWS, width), jnp.float32)  # interpreted: no such products
+                for block in range(blocks):
+                    gpu.barrier_wait(filled.at[slot(block)])
+                    factor = streamed[slot(block)]
+                    total += jnp.dot(x[block], factor, preferred_element_type=jnp.float32)
+                    gpu.barrier_arrive(free.at[slot(block)])
+                return total
+
+            def part(x: jax.Array, block: int) -> jax.Array:
+                return x[:, block * _COLUMNS : (block + 1) * _COLUMNS]
 
             def cosine_block(block: int) -> Any:
                 return cosines.at[warpgroup, :, pl.ds(block * _COLUMNS, _COLUMNS)]
@@ -144,23 +148,24 @@ def evaluate(
             def waiting_place(layer: int) -> Any:
                 return waiting_ref.at[(cell * _WARPGROUPS + warpgroup) * waiting + layer]
 
-            value: Any = 0
+            value: Any = None
             back: list[jax.Array] = []
-            sines = [jnp.sin(first(block)).astype(jnp.float16) for block in range(blocks)]
+            sines = [jnp.sin(first_angle(block)).astype(jnp.float16) for block in range(blocks)]
             for layer in range(layers):
+                z, sines = product(sines), []
                 if 0 < layer < layers - 1 and with_gradient:
                     gpu.wait_smem_to_gmem(0, wait_read_only=True)
-                z, sines = product(sines), []
                 for block in range(blocks):
-                    angle = z[block] + row(bias + 1 + layer, block)
+                    angle = part(z, block) + spread(bias_rows.at[layer], block)
                     sine = jnp.sin(angle)
                     if layer < layers - 1:
                         sines.append(sine.astype(jnp.float16))
                         if with_gradient:
                             cosine_block(block)[...] = jnp.cos(angle).astype(jnp.float16)
                         continue
-                    weight = row(output, block)
-                    value += (sine * weight).sum(axis=1)
+                    weight = spread(output_row, block)
+                    share = (sine * weight).sum(axis=1)
+                    value = share if value is None else value + share
                     if with_gradient:
                         back.append((weight * jnp.cos(angle)).astype(jnp.float16))
                 if layer < waiting:
@@ -176,18 +181,20 @@ def evaluate(
                         gpu.barrier_wait(returned.at[warpgroup])
                     back = []
                     for block in range(blocks):
-                        cosine = gpu.load(cosine_block(block), layout=_LAYOUT)
-                        back.append(slope[block].astype(jnp.float16) * cosine)
+                        upstream = part(slope, block).astype(jnp.float16)
+                        back.append(upstream * gpu.load(cosine_block(block), layout=_LAYOUT))
                     if before >= 0:
                         gpu.commit_smem()
                         place = cosines.at[warpgroup]
                         gpu.copy_gmem_to_smem(waiting_place(before), place, returned.at[warpgroup])
                 slope = product(back)
-                gradient: list[Any] = [0, 0, 0]
+                gradient: list[Any] = [None] * 3
                 for block in range(blocks):
-                    upstream = slope[block] * jnp.cos(first(block))
+                    upstream = part(slope, block) * jnp.cos(first_angle(block))
                     for axis in range(3):
-                        gradient[axis] += (upstream * row(axis, block)).sum(axis=1)
+                        share = (upstream * spread(first_rows.at[axis], block)).sum(axis=1)
+                        known = gradient[axis]
+                        gradient[axis] = share if known is None else known + share
                 for axis in range(3):
                     gradients.at[warpgroup, axis][...] = gradient[axis]
 
@@ -206,9 +213,12 @@ def evaluate(
 
             @pl.when(warpgroup == 0)
             def _() -> None:
-                gpu.copy_gmem_to_smem(table_ref, shared, loaded)
+                gpu.copy_gmem_to_smem(first_ref, first_rows, loaded.at[0])
+                gpu.copy_gmem_to_smem(biases_ref, bias_rows, loaded.at[1])
+                gpu.copy_gmem_to_smem(output_ref, output_row, loaded.at[2])
 
-            gpu.barrier_wait(loaded)
+            for index in range(3):
+                gpu.barrier_wait(loaded.at[index])
             lax.fori_loop(0, turns, compute_tile, None)
 
         @pl.when(warpgroup == _WARPGROUPS)
@@ -232,15 +242,17 @@ def evaluate(
     def entry(*references: Any) -> None:
         rows = _ROWS if with_gradient else 8
         pl.run_scoped(
-            lambda *scratch: body(*references, scratch),
+            lambda *scratch: body(*references, scratch=scratch),
             gpu.SMEM((stages, _COLUMNS, width), jnp.float16, transforms=_SWIZZLED),
-            gpu.SMEM(table.shape, jnp.float32),
-            gpu.SMEM((_WARPGROUPS, rows, width), jnp.float16, transforms=_SWIZZLED),
+            gpu.SMEM(first.shape, jnp.float32),
+            gpu.SMEM(biases.shape, jnp.float32),
+            gpu.SMEM(output.shape, jnp.float32),
             gpu.SMEM((_WARPGROUPS, _ROWS), jnp.float32),
             gpu.SMEM((_WARPGROUPS, 3, _ROWS), jnp.float32),
+            gpu.SMEM((_WARPGROUPS, rows, width), jnp.float16, transforms=_SWIZZLED),
             gpu.Barrier(num_barriers=stages),
             gpu.Barrier(num_barriers=stages, num_arrivals=_WARPGROUPS),
-            gpu.Barrier(),
+            gpu.Barrier(num_barriers=3),
             gpu.Barrier(num_barriers=_WARPGROUPS),
             collective_axes="warpgroup",
         )
@@ -262,5 +274,5 @@ def evaluate(
         compiler_params=gpu.CompilerParams(approx_math=True),
         **options,
     )
-    value, gradient, _ = kernel(points, table, weights)
+    value, gradient, _ = kernel(points, first, weights, biases, output)
     return value, gradient
