@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.network import forward, tiles
+from hiosdf_jax._src.network import hopper, tiles
 from hiosdf_jax._src.network.fast_sine import sine
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
 
@@ -68,7 +68,7 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
     Returns:
         (...) m. Differentiable any number of times.
     """
-    return tiles.map_tiles(lambda rows: forward.value(config.frequency, params, rows), points)
+    return tiles.map_tiles(lambda rows: hopper.value(config.frequency, params, rows), points)
 
 
 @functools.partial(predict.defjvp, symbolic_zeros=True)
@@ -95,7 +95,7 @@ def predict_with_gradient(
         The values (...) m and their gradients (..., 3). Differentiable any number of times.
     """
     return tiles.map_tiles(
-        lambda rows: forward.value_and_gradient(config.frequency, params, rows), points
+        lambda rows: hopper.value_and_gradient(config.frequency, params, rows), points
     )
 
 

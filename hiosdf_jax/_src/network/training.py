@@ -164,7 +164,9 @@ def train(
         lambda old, new: average * old + (1 - average) * new, network.average, params
     )
     points = samples.points_world - network.origin_world
-    residual = siren.predict(config, mean, points) - samples.sdf
+    # By XLA: a kernel for one evaluation per update would take longer to compile than it saves.
+    value = tiles.map_tiles(partial(forward.value, config.frequency, mean), points)
+    residual = value - samples.sdf
     mean = siren.shift_output(config, mean, -_median(residual, samples.weight))
     trained = network.replace(params=params, average=mean, optimizer=state)
     usable, fresh = _is_finite(network.optimizer), optimizer.init(network.params)

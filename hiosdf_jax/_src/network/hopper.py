@@ -1,0 +1,151 @@
+"""Chooses how a SIREN is evaluated: by one kernel on a Hopper GPU, else by XLA."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+
+from hiosdf_jax._src.network import forward
+
+_HOPPER = "9.0"  # CUDA's compute capability
+_WIDTHS = (128, 256)
+_MOST_LAYERS = 8  # more biases than that do not fit into shared memory
+_LEAST_ROWS = 8192  # fewer gain little, and the kernel takes seconds to compile
+_TRIED_BEFORE = (0, 13)  # jax changes its interface for GPU kernels from version to version
+
+_INTERPRET: Any = None  # the tests' way to run the kernel on a CPU
+
+
+def value(frequency: float, params: Any, points: jax.Array) -> jax.Array:
+    """Evaluates the network; see `forward.value`.
+
+    Args:
+        frequency: omega_0.
+        params: The weights.
+        points: (..., 3) m, relative to the network's origin.
+
+    Returns:
+        (...) m. Without a derivative where a kernel computes it.
+    """
+    if not _has_kernel(params):
+        return forward.value(frequency, params, points)
+    return _value(jnp.float32(frequency), params, points)
+
+
+def value_and_gradient(
+    frequency: float, params: Any, points: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Evaluates the network and its gradient by the points; see `forward.value_and_gradient`.
+
+    Args:
+        frequency: omega_0.
+        params: The weights.
+        points: (..., 3) m, relative to the network's origin.
+
+    Returns:
+        The values (...) m and their gradients (..., 3). Without a derivative where a kernel
+        computes them.
+    """
+    if not _has_kernel(params):
+        return forward.value_and_gradient(frequency, params, points)
+    return _value_and_gradient(jnp.float32(frequency), params, points)
+
+
+def is_available() -> bool:
+    """Returns whether the default backend is one Hopper GPU, and jax a version that was tried.
+
+    XLA cannot divide a kernel of ours among several devices.
+    """
+    if jax.__version_info__ >= _TRIED_BEFORE:
+        return False
+    devices = jax.devices()
+    capability = getattr(devices[0], "compute_capability", None)
+    return len(devices) == 1 and jax.default_backend() == "gpu" and capability == _HOPPER
+
+
+def _has_kernel(params: Any) -> bool:
+    layers = forward.layers_of(params)
+    widths = {kernel.shape[1] for kernel, _ in layers[:-1]}
+    fits = len(widths) == 1 and widths <= set(_WIDTHS) and 3 <= len(layers) <= _MOST_LAYERS + 2
+    return fits and is_available()
+
+
+@custom_vmap
+def _value(frequency: jax.Array, params: Any, points: jax.Array) -> jax.Array:
+    def by_kernel(frequency: jax.Array, params: Any, points: jax.Array) -> jax.Array:
+        return _by_kernel(frequency, params, points, with_gradient=False)[0]
+
+    return _choose(by_kernel, forward.value, frequency, params, points)
+
+
+@custom_vmap
+def _value_and_gradient(
+    frequency: jax.Array, params: Any, points: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    def by_kernel(frequency: jax.Array, params: Any, points: jax.Array) -> Any:
+        return _by_kernel(frequency, params, points, with_gradient=True)
+
+    return _choose(by_kernel, forward.value_and_gradient, frequency, params, points)
+
+
+@_value.def_vmap
+def _value_of_batch(size: int, batched: Any, *arguments: Any) -> Any:
+    return _batch(_value, forward.value, batched, arguments), True
+
+
+@_value_and_gradient.def_vmap
+def _value_and_gradient_of_batch(size: int, batched: Any, *arguments: Any) -> Any:
+    result = _batch(_value_and_gradient, forward.value_and_gradient, batched, arguments)
+    return result, (True, True)
+
+
+def _batch(function: Any, by_xla: Any, batched: Any, arguments: Any) -> Any:
+    """Takes a batch of points as more rows; several networks at once are left to XLA."""
+    if any(jax.tree.leaves(batched[:2])):
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+        return jax.vmap(by_xla, axes)(*arguments)
+    return function(*arguments)
+
+
+def _choose(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
+    """Decides by the number of points now, and by the device when the program is compiled."""
+    points = arguments[-1]
+    if points.size < 3 * _LEAST_ROWS:
+        return by_xla(*arguments)
+    if _INTERPRET is not None:
+        return by_kernel(*arguments)
+    return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
+
+
+def _by_kernel(
+    frequency: jax.Array, params: Any, points: jax.Array, *, with_gradient: bool
+) -> tuple[jax.Array, jax.Array]:
+    from hiosdf_jax._src.network import hopper_kernel  # needs a jax with GPU kernels
+
+    layers = forward.layers_of(params)
+    (first, first_bias), *hidden, (last, last_bias) = layers
+    kernels, biases = (jnp.stack(parts) for parts in zip(*hidden, strict=True))
+    weights = (frequency * kernels).astype(jnp.float16)
+    if with_gradient:
+        weights = jnp.concatenate([weights, weights.transpose(0, 2, 1)[::-1]])
+    rows = points.reshape(-1, 3)
+    count = rows.shape[0]
+    value, gradient = hopper_kernel.evaluate(
+        jnp.pad(rows, ((0, -count % hopper_kernel.TILE), (0, 0))),
+        frequency * jnp.concatenate([first, first_bias[None]]),
+        weights.reshape(-1, weights.shape[-1]),
+        frequency * biases,
+        last[:, 0],
+        with_gradient=with_gradient,
+        multiprocessors=_multiprocessors(),
+        interpret=_INTERPRET,
+    )
+    value = value[:count].reshape(points.shape[:-1]) + last_bias[0]
+    return value, gradient[:, :count].T.reshape(points.shape)
+
+
+def _multiprocessors() -> int:
+    return getattr(jax.devices()[0], "core_count", 132)
