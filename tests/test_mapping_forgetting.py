@@ -86,7 +86,7 @@ def test_the_same_clouds_fill_the_box_again(room_map, forgotten):
     "box", [3, ((0, 0, 0),), ((0, 0, 0), (1, 1, np.nan)), ((1, 0, 0), (0, 1, 1)), "wall"]
 )
 def test_a_bad_box_is_named(room_map, box):
-    with pytest.raises(ValueError, match="box is"):
+    with pytest.raises(ValueError, match=r"box (is|has dtype)"):
         hio.forget(room_map, box)
 
 

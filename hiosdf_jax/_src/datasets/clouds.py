@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import MOST_RETURNS, open_regular, parsing
+from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses
 
@@ -158,10 +158,11 @@ def _check_declared(file: BufferedReader) -> None:
         least, inflated = struct.unpack("<II", file.read(8))
         if inflated != size:
             raise ValueError(f"it inflates to {inflated} bytes, expected {size}")
-    if header.points > MOST_RETURNS or values > _PCD_VALUES:
+    most = most_returns(rest)
+    if header.points > most or values > _PCD_VALUES:
         raise ValueError(
             f"it declares {header.points} points of {values} values, expected at most "
-            f"{MOST_RETURNS} of {_PCD_VALUES}"
+            f"{most} of {_PCD_VALUES}"
         )
     if least > rest:
         raise ValueError(f"it has {rest} bytes of data, expected {least}; is it cut off?")

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.datasets import sensors
-from hiosdf_jax._src.datasets.files import MOST_RETURNS, open_regular, parsing
+from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 
 _to_cloud = jax.jit(sensors.depth_to_cloud)
 
@@ -68,8 +68,9 @@ def read_depth(
         content = file.read()
         image = Image.open(io.BytesIO(content), formats=("PNG",))
         width, height = image.size
-        if width * height > MOST_RETURNS:  # before a pixel is decoded
-            raise ValueError(f"{width} x {height} pixels, expected at most {MOST_RETURNS}")
+        most = most_returns(len(content))
+        if width * height > most:  # before a pixel is decoded
+            raise ValueError(f"{width} x {height} pixels, expected at most {most}")
         raw = np.asarray(image)
     if raw.dtype not in (np.uint16, np.int32) or raw.ndim != 2:  # int32 is Pillow's mode "I"
         raise ValueError(

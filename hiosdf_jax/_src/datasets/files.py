@@ -15,8 +15,7 @@ import numpy as np
 
 _Path = str | os.PathLike[str]
 
-MOST_RETURNS = 10_000_000
-"""Larger clouds are refused where a small file could hold one: in compressed images and clouds."""
+_ALWAYS_RETURNS = 4_000_000  # the images of most cameras have fewer pixels
 
 _LONGEST_LINE = 10_000
 _MOST_CHARACTERS = 300  # of a parser's message
@@ -136,6 +135,18 @@ def open_regular(path: _Path) -> io.BufferedReader:
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise ValueError(f"{path}: is a pipe or a device, expected a file")
     return open(path, "rb")
+
+
+def most_returns(file_bytes: int) -> int:
+    """Limits a cloud of a compressed file, which could inflate to a thousand times its size.
+
+    Args:
+        file_bytes: Size of the file.
+
+    Returns:
+        The largest number of returns: 4 million, or one for each byte of the file.
+    """
+    return max(_ALWAYS_RETURNS, file_bytes)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets import sensors
 from hiosdf_jax._src.datasets.archive import Archive
-from hiosdf_jax._src.datasets.files import MOST_RETURNS
+from hiosdf_jax._src.datasets.files import most_returns
 from hiosdf_jax._src.datasets.stream import frame_index
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.numerics.posed_cloud import check_pose
@@ -136,10 +136,11 @@ class NpzStream:
         return len(ranges)
 
     def _check_size(self, images: np.ndarray) -> None:
-        if math.prod(images.shape[1:]) > MOST_RETURNS:
+        most = most_returns(os.stat(self.path).st_size)
+        if math.prod(images.shape[1:]) > most:
             raise ValueError(
                 f"{self.path}: {self._layout} has shape {images.shape}, expected at most "
-                f"{MOST_RETURNS} returns per frame"
+                f"{most} returns per frame"
             )
 
     def _check_points(self) -> int:

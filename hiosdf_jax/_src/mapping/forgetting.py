@@ -41,9 +41,9 @@ def forget(state: MapState, box: Any) -> MapState:
         >>> state = hio.forget(state, ((1.0, 0.0, 0.0), (2.0, 0.2, 2.1)))
     """
     check_map(state)
+    corners = as_floats("box", box)
     if is_traced(*jax.tree.leaves(state)):
         raise ValueError("state is traced, expected a map: call forget outside jit")
-    corners = as_floats("box", box)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
         raise ValueError(f"box is {box!r}, expected ((x0, y0, z0), (x1, y1, z1)), ascending")
     return state.replace(grid=_forget(state.config, state.grid, corners))
