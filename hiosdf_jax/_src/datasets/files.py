@@ -15,7 +15,7 @@ import numpy as np
 
 _Path = str | os.PathLike[str]
 
-_ALWAYS_RETURNS = 4_000_000  # the images of most cameras have fewer pixels
+_ALWAYS_RETURNS = 1 << 21  # the images of most cameras have fewer pixels
 
 _LONGEST_LINE = 10_000
 _MOST_CHARACTERS = 300  # of a parser's message
@@ -144,7 +144,7 @@ def most_returns(file_bytes: int) -> int:
         file_bytes: Size of the file.
 
     Returns:
-        The largest number of returns: 4 million, or one for each byte of the file.
+        The largest number of returns: 2 million, or one for each byte of the file.
     """
     return max(_ALWAYS_RETURNS, file_bytes)
 

@@ -51,13 +51,13 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     """
     import trimesh
 
+    spacing = check_resolution(resolution)
     if isinstance(field, MapState):
         field = field_of(field)
     if not isinstance(field, Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
     if is_traced(*jax.tree.leaves(field)):
         raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
-    spacing = check_resolution(resolution)
     config, surface = field.config, field.surface
     vertices, normals, faces = polygons.triangulate(surface)
     if not len(faces):
