@@ -12,6 +12,7 @@ from hiosdf_jax._src.field import polygons
 from hiosdf_jax._src.field.lattice import check_resolution
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.state import Field, MapState, surface_of
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
         of the hits around each vertex along its normal, m.
 
     Raises:
-        ValueError: The resolution is not positive.
+        ValueError: `field` is something else, or the resolution is not positive.
 
     Example:
         >>> hio.extract_mesh(field, resolution=0.05).export("mesh.ply")
@@ -47,6 +48,8 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     import trimesh
 
     check_resolution(resolution)
+    if not isinstance(field, MapState | Field):
+        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
     config = field.config
     surface = field.surface if isinstance(field, Field) else surface_of(field.grid)
     vertices, normals, faces = polygons.triangulate(surface)
@@ -74,4 +77,4 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     )
 
 
-_move = jax.jit(lookup.move_to_surface, static_argnums=0)
+_move = jax.jit(plain(lookup.move_to_surface), static_argnums=0)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.mapping.stages import CHECKS, begin, run_stages
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.posed_cloud import as_floats, check_extras, check_pose, check_shapes
 from hiosdf_jax._src.state import MapState, check_map
 
@@ -66,6 +67,7 @@ def moving_rows(
     return _moving_rows_jit(state, padded, check_pose(pose), *extras)[:rows]
 
 
+@plain
 def _moving_rows(
     state: MapState,
     cloud: jax.Array,

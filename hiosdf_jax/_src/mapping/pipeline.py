@@ -22,6 +22,8 @@ from hiosdf_jax._src.mapping.stages import (
     run_stages,
 )
 from hiosdf_jax._src.network.training import init_network
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
     check_extras,
     check_shapes,
@@ -142,7 +144,7 @@ def update(
     limits = (config.min_range, config.max_range, config.min_in_range)
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
-    return compiled(state, cloud, pose, *extras)
+    return compiled(state, jax.device_put(cloud), jax.device_put(pose), *extras)
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
@@ -155,9 +157,13 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
 
     Returns:
         A field that shares no memory with the map.
+
+    Raises:
+        ValueError: `state` is not a map, or `stamp` is no number.
     """
+    check_map(state, stacked=True)
     field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=jnp.asarray(stamp, jnp.float32))
+    return field.replace(stamp=on_device("stamp", stamp))
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
@@ -172,8 +178,9 @@ def grow(state: MapState, bounds: Any) -> MapState:
         before inside the old box.
 
     Raises:
-        ValueError: The new bounds do not contain the old ones.
+        ValueError: `state` is not a map, or the new bounds do not contain the old ones.
     """
+    check_map(state)
     old = state.config
     new = dataclasses.replace(old, bounds=bounds)
     contained = np.all(np.asarray(new.bounds[0]) <= old.bounds[0]) and np.all(
@@ -190,6 +197,7 @@ def grow(state: MapState, bounds: Any) -> MapState:
     return rest.replace(config=new, grid=grid)
 
 
+@plain
 def _update(
     state: MapState,
     cloud: jax.Array,
@@ -202,7 +210,7 @@ def _update(
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     step = run_stages(begin(state, cloud, finite, pose, robot, noise), CHECKS)
-    return jax.lax.cond(
+    return cond(
         is_accepted(step),
         lambda _, step: run_stages(step, FUSION).state,
         refuse,

@@ -9,11 +9,21 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, sdf, sdf_and_grad
+from hiosdf_jax._src.field.points import AnyField, Unknown, distance, distance_and_grad
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.state import Bound
+
+_FAR = 1e30  # m
 
 
+@plain
 def sphere_clearance(
-    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
+    field: AnyField,
+    centers_world: Any,
+    radii: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> jax.Array:
     """Computes the signed distance of spheres to the nearest surface: sdf(center) - radius.
 
@@ -27,6 +37,8 @@ def sphere_clearance(
         radii: m, >= 0; any shape that broadcasts to that of the spheres, (...).
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         (...) float32, m; negative in collision, by the depth of penetration. Differentiable.
@@ -35,11 +47,16 @@ def sphere_clearance(
         ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
     """
     radii = checked_radii(radii, centers_world, "centers_world")
-    return sdf(field, centers_world, unknown) - radii
+    return distance(field, centers_world, unknown, bound) - radii
 
 
+@plain
 def sphere_clearance_and_grad(
-    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
+    field: AnyField,
+    centers_world: Any,
+    radii: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> tuple[jax.Array, jax.Array]:
     """Computes the clearance of spheres and its gradient, by one reverse-mode evaluation.
 
@@ -49,6 +66,8 @@ def sphere_clearance_and_grad(
         radii: As for `sphere_clearance`.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         The clearance (...) float32, m, and d(clearance)/d(center), (..., 3) float32.
@@ -57,7 +76,7 @@ def sphere_clearance_and_grad(
         ValueError: As for `sphere_clearance`.
     """
     radii = checked_radii(radii, centers_world, "centers_world")
-    value, gradient = sdf_and_grad(field, centers_world, unknown)
+    value, gradient = distance_and_grad(field, centers_world, unknown, bound)
     return value - radii, gradient
 
 
@@ -70,7 +89,7 @@ def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
         name: The caller's name for the centers.
 
     Returns:
-        The radii, float32.
+        The radii, float32; traced ones that are negative or not finite become 1e30 m.
 
     Raises:
         ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
@@ -79,14 +98,15 @@ def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
     if not shape or shape[-1] != 3:
         raise ValueError(f"{name} has shape {shape}, expected (..., 3)")
     if not isinstance(radii, jax.core.Tracer):
-        values = np.asarray(radii, float)
+        values = np.asarray(jax.device_get(radii), float)
         wrong = ~((values >= 0) & np.isfinite(values))
         if wrong.any():
             raise ValueError(
                 f"radii has {wrong.sum()} negative or non-finite values, expected all >= 0: "
                 f"{values[wrong][:5].tolist()} at {np.argwhere(wrong)[:5].tolist()}"
             )
-    radii = jnp.asarray(radii, jnp.float32)
+    traced = isinstance(radii, jax.core.Tracer)
+    radii = on_device("radii", radii)
     # Radii must not enlarge the batch: each sphere has one.
     dimensions = zip(radii.shape[::-1], shape[-2::-1], strict=False)
     if radii.ndim >= len(shape) or any(own not in (1, batch) for own, batch in dimensions):
@@ -94,4 +114,5 @@ def checked_radii(radii: Any, centers: Any, name: str) -> jax.Array:
             f"radii has shape {radii.shape}, expected one that broadcasts to {shape[:-1]}, "
             f"the spheres of {name}"
         )
-    return radii
+    # Inside jit a radius that is no radius is in collision: NaN would compare as clear.
+    return jnp.where((radii >= 0) & (radii <= _FAR), radii, _FAR) if traced else radii

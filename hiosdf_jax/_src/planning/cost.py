@@ -9,6 +9,9 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.modes import plain
+
 
 def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
     """Computes the obstacle cost of CHOMP (Zucker et al., IJRR 2013), zero beyond a margin.
@@ -34,10 +37,15 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
         ValueError: (Outside jit) the margin is not positive and finite.
     """
     if not isinstance(margin_m, jax.core.Tracer):
-        values = np.asarray(margin_m, float)
+        values = np.asarray(jax.device_get(margin_m), float)
         if not ((values > 0) & np.isfinite(values)).all():
             raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite")
-    clearance, margin = jnp.asarray(clearance, jnp.float32), jnp.asarray(margin_m, jnp.float32)
+    return _cost(on_device("clearance", clearance), on_device("margin_m", margin_m))
+
+
+@jax.jit
+@plain
+def _cost(clearance: jax.Array, margin: jax.Array) -> jax.Array:
     # Clipped before squaring: an infinite clearance must not make the gradient NaN.
     shortfall = jnp.clip(margin - clearance, 0, margin)
     return shortfall**2 / (2 * margin) + jnp.maximum(-clearance, 0)

@@ -16,11 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.exporting import exportable
 from hiosdf_jax._src.numerics.gradient import least
-from hiosdf_jax._src.planning.clearance import sphere_clearance
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.planning.clearance import sphere_clearance, sphere_clearance_and_grad
 from hiosdf_jax._src.planning.robot import cover, solids
+from hiosdf_jax._src.state import Bound
 
 
+@exportable()
 class RobotSpheres(flax.struct.PyTreeNode):
     """Spheres on the bodies of a robot; made by `spheres_from_model`.
 
@@ -35,6 +40,7 @@ class RobotSpheres(flax.struct.PyTreeNode):
     radii: jax.Array
 
 
+@exportable()
 class BodyPoses(NamedTuple):
     """Poses of bodies; `mjx.Data` and `mujoco.MjData` have the same two attributes.
 
@@ -94,6 +100,7 @@ def spheres_from_model(
     )
 
 
+@plain
 def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
     """Places a robot's spheres in a configuration.
 
@@ -103,12 +110,14 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
             `mujoco.MjData`, or `BodyPoses`.
 
     Returns:
-        Centers, (..., S, 3) float32, m, world. Differentiable.
+        Centers, (..., S, 3) float32, m, world. Differentiable. Inside jit they are NaN, i.e. in
+        collision, on bodies without a pose.
 
     Raises:
-        ValueError: A shape of the poses is wrong, or there are fewer bodies than the spheres need.
+        ValueError: A shape of the poses is wrong, there are fewer bodies than the spheres need, or
+            (outside jit) kinematics has not run.
     """
-    xpos, xmat = jnp.asarray(data.xpos, jnp.float32), jnp.asarray(data.xmat, jnp.float32)
+    xpos, xmat = on_device("data.xpos", data.xpos), on_device("data.xmat", data.xmat)
     if xpos.ndim < 2 or xpos.shape[-1] != 3:
         raise ValueError(f"data.xpos has shape {xpos.shape}, expected (..., B, 3)")
     if xmat.shape not in ((*xpos.shape, 3), (*xpos.shape[:-1], 9)):
@@ -124,13 +133,25 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
                 f"index in spheres.body"
             )
     rotations = xmat.reshape(*xpos.shape, 3)[..., spheres.body, :, :]
+    # Before kinematics MuJoCo's rotations are zero.
+    posed = jnp.any(rotations != 0, axis=(-2, -1))[..., None]
+    if not isinstance(posed, jax.core.Tracer) and not np.all(jax.device_get(posed)):
+        raise ValueError(
+            "data.xmat has rotations that are zero, expected poses of all bodies: run "
+            "mujoco.mj_kinematics(model, data) or mjx.kinematics(model, data) first"
+        )
     # Sums of products: a matrix product may run in reduced precision on a GPU.
     offsets_world = jnp.sum(rotations * spheres.centers_body[:, None, :], axis=-1)
-    return xpos[..., spheres.body, :] + offsets_world
+    return jnp.where(posed, xpos[..., spheres.body, :] + offsets_world, jnp.nan)
 
 
+@plain
 def robot_clearance(
-    field: AnyField, spheres: RobotSpheres, data: Any, unknown: Unknown = "obstacle"
+    field: AnyField,
+    spheres: RobotSpheres,
+    data: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> jax.Array:
     """Computes the least clearance of a robot's spheres in a configuration.
 
@@ -147,6 +168,8 @@ def robot_clearance(
         data: As for `place_spheres`.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         (...) float32, m; negative in collision. Differentiable, through `mjx.kinematics` also by
@@ -156,7 +179,57 @@ def robot_clearance(
         ValueError: As for `place_spheres` and `sphere_clearance`.
     """
     centers_world = place_spheres(spheres, data)
-    return least(sphere_clearance(field, centers_world, spheres.radii, unknown))
+    return least(sphere_clearance(field, centers_world, spheres.radii, unknown, bound))
+
+
+@plain
+def robot_clearance_and_grad(
+    field: AnyField,
+    spheres: RobotSpheres,
+    data: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Computes the clearance of a robot and its gradient by the motion of each body.
+
+    With the Jacobians of a body, for instance from `mujoco.mj_jacBody`, the gradient by the joints
+    is the sum over bodies b of jacp_b^T by_position[b] + jacr_b^T by_rotation[b].
+
+    Example:
+        model = mujoco.MjModel.from_xml_path("examples/rover.xml")
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        spheres = planning.spheres_from_model(model, tolerance_m=0.02)
+        clearance, by_position, by_rotation = planning.robot_clearance_and_grad(
+            field, spheres, data
+        )
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        spheres: The robot's spheres.
+        data: As for `place_spheres`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
+        bound: As for `robot_clearance`.
+
+    Returns:
+        The clearance (...) float32, m, and its gradients by the bodies' positions, (..., B, 3), and
+        by rotations around the origins of their frames, (..., B, 3) m/rad, world frame.
+
+    Raises:
+        ValueError: As for `robot_clearance`.
+    """
+    xpos = on_device("data.xpos", data.xpos)
+    centers_world = place_spheres(spheres, data)
+    value, slope = sphere_clearance_and_grad(field, centers_world, spheres.radii, unknown, bound)
+    nearest = jnp.arange(value.shape[-1]) == jnp.argmin(value, axis=-1)[..., None]
+    force = jnp.where(nearest[..., None], slope, 0)
+    torque = jnp.cross(centers_world - xpos[..., spheres.body, :], force)
+
+    def per_body(vectors: jax.Array) -> jax.Array:
+        return jnp.zeros_like(xpos).at[..., spheres.body, :].add(vectors)
+
+    return least(value), per_body(force), per_body(jnp.where(nearest[..., None], torque, 0))
 
 
 def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
