@@ -25,8 +25,11 @@ from hiosdf_jax._src.network.training import init_network
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
+    as_floats,
     check_extras,
+    check_pose,
     check_shapes,
+    pad_rows,
     prepare,
     warn_out_of_range,
     warn_outside,
@@ -145,6 +148,36 @@ def update(
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
     return compiled(state, jax.device_put(cloud), jax.device_put(pose), *extras)
+
+
+def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
+    """Brings a cloud to `config.max_points` rows, as `update` does outside jit.
+
+    In a loop inside `jit`, clouds of other sizes would compile `update` again. Pad them first.
+
+    Args:
+        config: The map's configuration.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns. Not inside jit.
+        pose: The cloud's pose, (4, 4). It matters for clouds of more than `max_points` rows: with
+            it, the same rows are drawn as by `update`.
+
+    Returns:
+        (max_points, 3) float32: the cloud and rows of NaN, or rows of it, drawn at random.
+
+    Raises:
+        ValueError: An argument has a wrong type or shape, or the cloud has no finite row.
+
+    Example:
+        >>> clouds = jnp.stack([hio.pad_cloud(config, cloud) for cloud in clouds])
+        >>> step = lambda state, frame: (hio.update(state, *frame), None)
+        >>> state, _ = jax.lax.scan(step, state, (clouds, poses))
+    """
+    if not isinstance(config, Config):
+        raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
+    if isinstance(cloud, jax.core.Tracer):
+        raise ValueError("cloud is traced, expected concrete numbers: call pad_cloud outside jit")
+    pose = None if pose is None else check_pose(pose)
+    return pad_rows(as_floats("cloud", cloud), config.max_points, pose)
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
