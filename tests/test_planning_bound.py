@@ -86,7 +86,9 @@ def test_every_clearance_takes_the_bound(fields):
     np.testing.assert_allclose(clearance, expected.min(), atol=1e-6)
     path = np.linspace(points[0], points[1], 8)[None]
     given, plain = (
-        planning.optimize_trajectory(field, path, radius_m=0.05, steps=1, bound=bound).clearance
+        planning.optimize_trajectory(
+            field, path, radius_m=0.05, steps=1, unknown="network", bound=bound
+        ).clearance
         for bound in ("lower", "sdf")
     )
     assert given < plain

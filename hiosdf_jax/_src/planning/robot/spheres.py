@@ -6,7 +6,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import numbers
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -58,36 +62,60 @@ def spheres_from_model(
     tolerance_m: float,
     bodies: Iterable[int | str] | None = None,
     geoms: Iterable[int | str] | None = None,
+    *,
+    budget_s: float = math.inf,
 ) -> RobotSpheres:
     """Covers geoms of a robot by spheres that protrude by at most a tolerance.
 
     The cover is complete. A mesh is covered as it is, with all that it encloses, not as the convex
     hull that MuJoCo collides. Half the tolerance takes about four times as many spheres. Not inside
-    jit.
+    jit. Meshes take seconds to minutes: a bar in the terminal shows the progress.
 
     Example:
         model = mujoco.MjModel.from_xml_path("examples/rover.xml")
         spheres = planning.spheres_from_model(model, tolerance_m=0.02)
 
     Args:
-        model: `mujoco.MjModel` or `mjx.Model`.
+        model: `mujoco.MjModel`, `mjx.Model`, `mujoco.MjSpec`, or the path of an XML file.
         tolerance_m: Most that a sphere may protrude beyond its geom, m, > 0.
         bodies: Names or ids of the bodies whose colliding geoms (contype or conaffinity not 0)
-            are covered; by default all bodies but the world.
+            are covered; by default those that can move, or all but the world if none can.
         geoms: Names or ids of the geoms to cover, instead of `bodies`.
+        budget_s: Longest time that it may take, s. It is exceeded by up to the time of one search.
 
     Returns:
         The spheres, in the order of the geoms.
 
+    Warns:
+        UserWarning: A chosen body has geoms, but none that collides: nothing covers it.
+
     Raises:
         ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen, or
             a chosen geom is a plane, a height field or an SDF.
+        TimeoutError: The time is up.
     """
-    if isinstance(tolerance_m, bool) or not (math.isfinite(tolerance_m) and tolerance_m > 0):
-        raise ValueError(f"tolerance_m is {tolerance_m}, expected > 0 and finite")
-    parts = []
-    for geom in _chosen_geoms(model, bodies, geoms):
-        centers, radii = _cover_geom(model, geom, float(tolerance_m))
+    # Imported here: a robot that loads its spheres from a file needs no progress bar.
+    from tqdm import tqdm
+
+    if isinstance(tolerance_m, bool) or not (
+        isinstance(tolerance_m, numbers.Real) and math.isfinite(tolerance_m) and tolerance_m > 0
+    ):
+        raise ValueError(f"tolerance_m is {tolerance_m!r}, expected meters > 0 and finite")
+    model = _compiled_model(model)
+    chosen = _chosen_geoms(model, bodies, geoms)
+    start, parts = time.monotonic(), []
+
+    def check_time() -> None:
+        if time.monotonic() - start > budget_s:
+            raise TimeoutError(
+                f"covered {len(parts)} of {len(chosen)} geoms in budget_s = {budget_s} s, expected "
+                f"all: allow more time, a tolerance above {tolerance_m} m, or simpler geoms"
+            )
+
+    # Without a terminal, or within two seconds, nothing is shown.
+    for geom in tqdm(chosen, desc="covering geoms by spheres", delay=2, disable=None):
+        check_time()
+        centers, radii = _cover_geom(model, geom, float(tolerance_m), check_time)
         rotation = _rotation(np.asarray(model.geom_quat[geom], float))
         centers_body = np.asarray(model.geom_pos[geom], float) + centers @ rotation.T
         body = np.full(len(radii), model.geom_bodyid[geom])
@@ -232,6 +260,21 @@ def robot_clearance_and_grad(
     return least(value), per_body(force), per_body(jnp.where(nearest[..., None], torque, 0))
 
 
+def _compiled_model(model: Any) -> Any:
+    """Reads the model of a file, or compiles that of a specification."""
+    if isinstance(model, str | os.PathLike):
+        import mujoco
+
+        return mujoco.MjModel.from_xml_path(os.fspath(model))
+    if hasattr(model, "compile") and not hasattr(model, "nbody"):
+        return model.compile()
+    if not hasattr(model, "geom_bodyid"):
+        raise ValueError(
+            f"model is {type(model).__name__}, expected a MjModel, mjx.Model, MjSpec or a path"
+        )
+    return model
+
+
 def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
     if bodies is not None and geoms is not None:
         raise ValueError("bodies and geoms are both given, expected at most one of them")
@@ -239,16 +282,35 @@ def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
         chosen = _ids(model, geoms, "geom", model.ngeom)
     else:
         carriers = (
-            range(1, model.nbody) if bodies is None else _ids(model, bodies, "body", model.nbody)
+            _moving_bodies(model) if bodies is None else _ids(model, bodies, "body", model.nbody)
         )
         colliding = (np.asarray(model.geom_contype) != 0) | (
             np.asarray(model.geom_conaffinity) != 0
         )
         carried = np.isin(np.asarray(model.geom_bodyid), list(carriers))
         chosen = np.nonzero(colliding & carried)[0].tolist()
+        _warn_of_bare_bodies(model, carried, chosen)
     if not chosen:
         raise ValueError("no geom is chosen, expected geoms, or bodies with colliding geoms")
     return sorted(set(chosen))
+
+
+def _moving_bodies(model: Any) -> list[int]:
+    """Lists the bodies that can move, or all but the world where none can."""
+    moving = np.nonzero(np.asarray(model.body_weldid) != 0)[0].tolist()
+    return moving or list(range(1, model.nbody))
+
+
+def _warn_of_bare_bodies(model: Any, carried: np.ndarray, chosen: list[int]) -> None:
+    bodies = np.asarray(model.geom_bodyid)
+    bare = sorted(set(bodies[carried].tolist()) - set(bodies[chosen].tolist()))
+    if bare and chosen:
+        names = [_name(model, "body", body) for body in bare]
+        warnings.warn(
+            f"bodies {names} have geoms but none that collides, so that no sphere covers them: "
+            f"choose geoms by geoms= if they should be covered",
+            stacklevel=4,
+        )
 
 
 def _ids(model: Any, wanted: Any, kind: str, count: int) -> list[int]:
@@ -273,7 +335,9 @@ def _name(model: Any, kind: str, index: int) -> str:
     return model.names[start : model.names.index(b"\0", start)].decode()
 
 
-def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.SphereCover:
+def _cover_geom(
+    model: Any, geom: int, tolerance: float, check_time: Callable[[], None]
+) -> cover.SphereCover:
     # Imported here: nothing else in this module needs it.
     import mujoco
 
@@ -287,13 +351,16 @@ def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.SphereCover:
         return cover.cover_box(size, tolerance)
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         half = size[[0, 0, 1]]
-        return cover.cover_solid(solids.cylinder(size[0], size[1]), -half, half, tolerance)
+        return cover.cover_solid(
+            solids.cylinder(size[0], size[1]), -half, half, tolerance, check_time
+        )
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        return cover.cover_solid(solids.ellipsoid(size), -size, size, tolerance)
+        return cover.cover_solid(solids.ellipsoid(size), -size, size, tolerance, check_time)
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         vertices, faces = _mesh(model, int(model.geom_dataid[geom]))
         solid = solids.mesh(vertices, faces, tolerance)
-        return cover.cover_solid(solid, vertices.min(axis=0), vertices.max(axis=0), tolerance)
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        return cover.cover_solid(solid, low, high, tolerance, check_time)
     raise ValueError(
         f"geom {geom} ({_name(model, 'geom', geom)!r}) is of type "
         f"{kind.name.removeprefix('mjGEOM_').lower()}, expected sphere, capsule, box, cylinder, "
