@@ -152,9 +152,13 @@ def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, n
 
 
 def test_bodies_and_geoms_are_chosen_by_name_or_id(model, alone, spheres):
-    # By default all colliding geoms but the world's, in order: neither the floor nor "look".
-    together = jax.tree.map(lambda *parts: np.concatenate(parts), *alone.values())
+    # By default the colliding geoms of what can move, in order: neither the base nor "look".
+    moving = [part for name, part in alone.items() if name != "stand"]
+    together = jax.tree.map(lambda *parts: np.concatenate(parts), *moving)
     jax.tree.map(np.testing.assert_array_equal, spheres, together)
+    every = planning.spheres_from_model(model, TOLERANCE, bodies=range(1, model.nbody))
+    together = jax.tree.map(lambda *parts: np.concatenate(parts), *alone.values())
+    jax.tree.map(np.testing.assert_array_equal, every, together)
     assert [leaf.dtype for leaf in jax.tree.leaves(spheres)] == [
         jnp.int32,
         jnp.float32,
