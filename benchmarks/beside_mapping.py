@@ -30,10 +30,9 @@ def run(seconds, serve):
     state = hio.init(config, jax.random.key(0))
     for cloud, pose in frames[:3]:  # compiled, and past the warm-up
         state = hio.update(state, cloud, pose)
-    centers = jnp.asarray(
-        np.random.default_rng(0).uniform(*map(np.asarray, demo.BOUNDS_WORLD), (1000, 3)),
-        jnp.float32,
-    )
+    low, high = np.asarray(demo.BOUNDS_WORLD)
+    centers = np.random.default_rng(0).uniform(low, high, (1000, 3))
+    centers = jnp.asarray(centers, jnp.float32)
     control = jax.jit(planning.sphere_clearance_and_grad)
 
     def bake(field):
@@ -70,7 +69,7 @@ def run(seconds, serve):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Counts missed deadlines beside a mapper.")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--serve", choices=["map", "baked"], default="baked")
     options = parser.parse_args()
