@@ -1,5 +1,11 @@
 """Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463)."""
 
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 from hiosdf_jax import planning
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.field.baking import bake
@@ -9,8 +15,16 @@ from hiosdf_jax._src.mapping.background import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.moving import moving_rows
-from hiosdf_jax._src.mapping.pipeline import grow, init, snapshot, update
+from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
+
+if TYPE_CHECKING:
+    from hiosdf_jax import datasets as datasets
+    from hiosdf_jax import demo as demo
+    from hiosdf_jax import scoring as scoring
+    from hiosdf_jax import view as view
+
+__version__ = "0.1.0"
 
 __all__ = [
     "BackgroundMapper",
@@ -28,6 +42,7 @@ __all__ = [
     "init",
     "load",
     "moving_rows",
+    "pad_cloud",
     "planning",
     "query",
     "save",
@@ -36,3 +51,17 @@ __all__ = [
     "snapshot",
     "update",
 ]
+
+_MODULES = ("datasets", "demo", "scoring", "view")
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Imports the other public modules on first use."""
+    if name in _MODULES:
+        return importlib.import_module(f"hiosdf_jax.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Lists them, too."""
+    return sorted({*globals(), *_MODULES})

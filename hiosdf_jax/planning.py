@@ -23,9 +23,10 @@ from hiosdf_jax._src.planning.robot.spheres import (
     RobotSpheres,
     place_spheres,
     robot_clearance,
+    robot_clearance_and_grad,
     spheres_from_model,
 )
-from hiosdf_jax._src.planning.sweep import swept_clearance
+from hiosdf_jax._src.planning.sweep import swept_clearance, swept_clearance_and_grad
 from hiosdf_jax._src.planning.trajectory import Trajectory, optimize_trajectory, waves
 
 if TYPE_CHECKING:
@@ -42,10 +43,12 @@ __all__ = [
     "optimize_trajectory",
     "place_spheres",
     "robot_clearance",
+    "robot_clearance_and_grad",
     "sphere_clearance",
     "sphere_clearance_and_grad",
     "spheres_from_model",
     "swept_clearance",
+    "swept_clearance_and_grad",
     "waves",
 ]
 
@@ -55,6 +58,8 @@ _ADAPTERS = {"cbf": "cbfpy", "frax": "frax", "mjx": "mujoco", "mppi": "jax_mppi"
 
 def __getattr__(name: str) -> ModuleType:
     """Imports an adapter on first use."""
+    if name == "trajectory":
+        return importlib.import_module("hiosdf_jax._src.planning.trajectory")
     if name not in _ADAPTERS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

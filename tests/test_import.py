@@ -2,6 +2,9 @@
 
 import subprocess
 import sys
+from pathlib import Path
+
+import hiosdf_jax as hio
 
 OPTIONAL = ["mujoco", "mujoco.mjx", "trimesh", "skimage", "matplotlib", "scipy.spatial", "tqdm"]
 
@@ -31,3 +34,17 @@ for name in ("matplotlib", "trimesh", "skimage", "tqdm"):
 import hiosdf_jax.datasets, hiosdf_jax.planning, hiosdf_jax.scoring, hiosdf_jax.view
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_modules_are_attributes_and_the_version_is_known():
+    code = """
+import hiosdf_jax as hio, sys
+assert "hiosdf_jax.demo" not in sys.modules
+names = [hio.demo, hio.datasets, hio.scoring, hio.view, hio.planning.trajectory, hio.__version__]
+assert {"demo", "datasets", "scoring", "view"} <= set(dir(hio))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_package_says_that_it_has_types():
+    assert (Path(hio.__file__).parent / "py.typed").exists()

@@ -158,7 +158,7 @@ def test_a_frame_of_a_wrong_type_is_counted_and_mapping_continues(empty_map, clo
     assert int(mapper.field.updates) == 1
 
 
-@pytest.mark.parametrize("stamp", [None, "soon", np.nan, np.inf, 10**400, 1e39])
+@pytest.mark.parametrize("stamp", [None, "soon", "1.5", np.nan, np.inf, 10**400, 1e39, 1.7e9, 1j])
 def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
     with hio.BackgroundMapper(empty_map) as mapper:
         with pytest.raises(ValueError, match=r"stamp is .*, expected a finite number of seconds"):
@@ -169,6 +169,111 @@ def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
 def test_a_mapper_takes_maps_only(empty_map):
     with pytest.raises(ValueError, match="state is Field, expected a MapState"):
         hio.BackgroundMapper(hio.snapshot(empty_map))
+
+
+BAD_FRAMES = {
+    **{name: (cloud, np.eye(4)) for name, cloud in BAD_CLOUDS.items()},
+    "a cloud of a wrong shape": (np.ones((5, 2)), np.eye(4)),
+    "a pose of a wrong shape": (np.ones((5, 3)), np.eye(3)),
+    "a pose that is not finite": (np.ones((5, 3)), np.full((4, 4), np.nan)),
+    "a pose of words": (np.ones((5, 3)), [["a"] * 4] * 4),
+    "a cloud that is out of range": (np.full((250, 3), 90.0), np.eye(4)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:cloud has")
+def test_one_bad_frame_in_ten_leaves_the_nine_others(empty_map):
+    expected, reasons = empty_map, []
+    with hio.BackgroundMapper(empty_map) as mapper:
+        for k, bad in enumerate(BAD_FRAMES.values()):
+            for frame in [*stream(2), bad]:
+                mapper.put(*frame, stamp=float(k))
+                mapper.wait()
+            reasons.append(str(mapper.rejection))
+            for frame in stream(2):
+                expected = hio.update(expected, *frame)
+        assert mapper.rejected == len(BAD_FRAMES) and mapper.failure is None
+    assert int(mapper.field.updates) == 2 * len(BAD_FRAMES)
+    np.testing.assert_array_equal(hio.sdf(mapper.field, POINTS), hio.sdf(expected, POINTS))
+    assert all(reasons) and len(set(reasons)) >= len(reasons) - 2
+    assert "flags OUT_OF_RANGE" in reasons[-1]
+
+
+def test_the_age_of_the_field_keeps_its_digits(empty_map):
+    with hio.BackgroundMapper(empty_map) as mapper:
+        assert mapper.age(5.0) == np.inf
+        mapper.put(*stream(1)[0], stamp=500_000.000_1)
+        mapper.wait()
+        assert mapper.age(500_000.000_4) == pytest.approx(3e-4, abs=1e-9)
+        with pytest.raises(ValueError, match="now is nan, expected a finite number of seconds"):
+            mapper.age(float("nan"))
+
+
+def test_what_serve_makes_of_a_snapshot_is_the_field(empty_map):
+    centers = [np.zeros(3)]
+
+    def window(field):
+        return hio.bake(field, 0.2, center=centers[-1], size=(0.8, 0.8, 0.8))
+
+    cloud, pose = stream(1)[0]
+    with hio.BackgroundMapper(empty_map, serve=window) as mapper:
+        assert isinstance(mapper.field, hio.Baked) and mapper.field.window
+        mapper.put(cloud, pose, stamp=1.0)
+        state = mapper.wait()
+        assert arrays_equal(mapper.field, window(hio.snapshot(state, 1.0)))
+        centers.append(np.full(3, np.nan))
+        before = mapper.field
+        mapper.put(cloud, pose, stamp=2.0)
+        mapper.wait()
+        assert mapper.rejected == 1 and "center" in str(mapper.rejection)
+        assert mapper.field is before and mapper.age(2.0) == 1.0
+        centers.append(np.ones(3))
+        mapper.put(cloud, pose, stamp=3.0)
+        assert int(mapper.wait().updates) == 3
+        assert int(mapper.field.updates) == 3
+
+
+def test_an_exception_of_the_controller_is_kept(empty_map, monkeypatch):
+    def broken(*_, **__):
+        raise OSError("no device")
+
+    monkeypatch.setattr(background, "update", broken)
+    with pytest.raises(KeyError, match="goal"), hio.BackgroundMapper(empty_map) as mapper:
+        mapper.put(*stream(1)[0])
+        raise KeyError("goal")
+    with pytest.raises(RuntimeError, match="the BackgroundMapper"):
+        mapper.put(*stream(1)[0])
+
+
+def test_a_failure_can_be_read_without_an_exception(empty_map, monkeypatch):
+    def broken(*_, **__):
+        raise OSError("no device")
+
+    monkeypatch.setattr(background, "update", broken)
+    mapper = hio.BackgroundMapper(empty_map)
+    mapper.put(*stream(1)[0])
+    with pytest.raises(RuntimeError, match="thread has failed"):
+        mapper.wait()
+    assert isinstance(mapper.failure, OSError)
+    with pytest.raises(RuntimeError, match="thread has failed"):
+        mapper.close()
+
+
+def test_closing_and_waiting_end_while_a_frame_takes_forever(empty_map, monkeypatch):
+    go = threading.Event()
+
+    def endless(state, *_, **__):
+        assert go.wait(30)
+        return state
+
+    monkeypatch.setattr(background, "update", endless)
+    mapper = hio.BackgroundMapper(empty_map)
+    mapper.put(*stream(1)[0])
+    for call in (mapper.wait, mapper.close):
+        with pytest.raises(TimeoutError, match=r"still works after 0\.1 s"):
+            call(timeout_s=0.1)
+    go.set()
+    mapper.close()
 
 
 ENDINGS = {"end of the script": ("", 0), "exit": ("sys.exit(7)", 7), "exception": ("1 / 0", 1)}

@@ -21,7 +21,9 @@ ADAPTERS = {"cbf": "cbfpy", "frax": "frax", "mjx": "mujoco", "mppi": "jax_mppi"}
 EXAMPLES = [
     "sphere_clearance",
     "robot_clearance",
+    "robot_clearance_and_grad",
     "swept_clearance",
+    "swept_clearance_and_grad",
     "spheres_from_model",
     "collision_cost",
     "optimize_trajectory",
@@ -52,7 +54,7 @@ def defaults_of_unknown(module, names):
 
 def test_unseen_space_is_an_obstacle_by_default():
     defaults = defaults_of_unknown(planning, planning.__all__)
-    assert len(defaults) == 5
+    assert len(defaults) == 7
     assert set(defaults.values()) == {"obstacle"}
 
 

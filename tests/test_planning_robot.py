@@ -152,9 +152,13 @@ def test_spheres_cover_a_geom_and_protrude_at_most_the_tolerance(model, alone, n
 
 
 def test_bodies_and_geoms_are_chosen_by_name_or_id(model, alone, spheres):
-    # By default all colliding geoms but the world's, in order: neither the floor nor "look".
-    together = jax.tree.map(lambda *parts: np.concatenate(parts), *alone.values())
+    # By default the colliding geoms of what can move, in order: neither the base nor "look".
+    moving = [part for name, part in alone.items() if name != "stand"]
+    together = jax.tree.map(lambda *parts: np.concatenate(parts), *moving)
     jax.tree.map(np.testing.assert_array_equal, spheres, together)
+    every = planning.spheres_from_model(model, TOLERANCE, bodies=range(1, model.nbody))
+    together = jax.tree.map(lambda *parts: np.concatenate(parts), *alone.values())
+    jax.tree.map(np.testing.assert_array_equal, every, together)
     assert [leaf.dtype for leaf in jax.tree.leaves(spheres)] == [
         jnp.int32,
         jnp.float32,
@@ -354,3 +358,88 @@ def test_bad_poses_are_refused(model, spheres):
     ):
         with pytest.raises(ValueError, match=words):
             planning.place_spheres(spheres, poses)
+
+
+TWO_BODIES = """
+<mujoco>
+  <worldbody>
+    <body name="post" pos="1 0 0"><geom type="box" size="0.1 0.1 0.5"/></body>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.05"/>
+      <body name="shell" pos="0 0 0.5">
+        <joint axis="1 0 0"/>
+        <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+        <geom type="sphere" size="0.1" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_moving_bodies_of_models_specifications_and_files(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(TWO_BODIES)
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES)
+    arm = model.body("arm").id
+    found = []
+    for source in (model, mujoco.MjSpec.from_string(TWO_BODIES), path, str(path)):
+        with pytest.warns(UserWarning, match=r"bodies \['shell'\] have geoms but none that coll"):
+            found.append(planning.spheres_from_model(source, 0.01))
+    for spheres in found:
+        assert set(np.asarray(spheres.body).tolist()) == {arm}
+        np.testing.assert_array_equal(spheres.centers_body, found[0].centers_body)
+    every = planning.spheres_from_model(model, 0.01, bodies=["post", "arm"])
+    assert model.body("post").id in np.asarray(every.body)
+
+
+@pytest.mark.parametrize("tolerance", ["1cm", None, True, 0, -0.1, np.nan, 1j])
+def test_a_tolerance_that_is_no_length_is_refused(tolerance):
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES)
+    with pytest.raises(ValueError, match=r"tolerance_m is .*, expected meters > 0"):
+        planning.spheres_from_model(model, tolerance)
+    with pytest.raises(ValueError, match="model is int, expected a MjModel"):
+        planning.spheres_from_model(3, 0.01)
+
+
+def test_the_time_for_covers_is_limited():
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES)
+    with pytest.raises(TimeoutError, match=r"covered 0 of 1 geoms in budget_s = -1 s"):
+        planning.spheres_from_model(model, 0.01, bodies=["arm"], budget_s=-1)
+
+
+def test_poses_before_kinematics_are_refused_and_inside_jit_in_collision():
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES)
+    spheres = planning.spheres_from_model(model, 0.01, bodies=["arm"])
+    data, field = mujoco.MjData(model), half_space([0.0, 0.0, 1.0], -2.0)
+    with pytest.raises(ValueError, match=r"data\.xmat has rotations that are zero.*mj_kinematics"):
+        planning.robot_clearance(field, spheres, data)
+    clearance = jax.jit(planning.robot_clearance)
+    unposed = planning.BodyPoses(jnp.asarray(data.xpos), jnp.asarray(data.xmat))
+    assert clearance(field, spheres, unposed) < -1e29
+    mujoco.mj_kinematics(model, data)
+    posed = planning.BodyPoses(jnp.asarray(data.xpos), jnp.asarray(data.xmat))
+    np.testing.assert_allclose(
+        clearance(field, spheres, posed), planning.robot_clearance(field, spheres, data), atol=1e-6
+    )
+
+
+def test_the_gradient_of_a_robot_with_jacobians_is_that_by_the_joints():
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES)
+    spheres = planning.spheres_from_model(model, 0.01, bodies=["arm"])
+    data, field = mujoco.MjData(model), half_space([1.0, 0.0, 0.0], -2.0)
+
+    def at(angle):
+        data.qpos[0] = angle
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        return planning.robot_clearance_and_grad(field, spheres, data, unknown="network")
+
+    up, down = at(0.301)[0], at(0.299)[0]
+    _, by_position, by_rotation = at(0.3)
+    body, by_joint = model.body("arm").id, np.zeros(model.nv)
+    jacp, jacr = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, jacp, jacr, body)
+    by_joint = jacp.T @ np.asarray(by_position[body]) + jacr.T @ np.asarray(by_rotation[body])
+    np.testing.assert_allclose(by_joint[0], (up - down) / 0.002, atol=2e-3)

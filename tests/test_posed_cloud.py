@@ -2,16 +2,20 @@
 
 import warnings
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from poses import random_pose
+from room import CONFIG
 
+import hiosdf_jax as hio
 from hiosdf_jax._src.numerics.posed_cloud import (
     as_traced,
     check_pose,
     finite_rows,
+    prepare,
     warn_out_of_range,
     warn_outside,
 )
@@ -141,3 +145,24 @@ def test_returns_outside_the_bounds_are_warned_of(prepared, inside, warns):
     messages = [str(warning.message) for warning in caught]
     assert len(messages) == warns
     assert all("less than 1 % of its returns in range inside the bounds" in m for m in messages)
+
+
+@pytest.mark.parametrize("rows", [1, 250, 300, 301, 4000])
+def test_a_padded_cloud_is_what_update_maps(rows):
+    cloud, pose = np.random.default_rng(rows).normal(size=(rows, 3)), np.eye(4)
+    cloud[0, 1] = np.nan if rows > 1 else 1.0
+    padded = hio.pad_cloud(CONFIG, cloud, pose)
+    assert padded.shape == (CONFIG.max_points, 3) and padded.dtype == np.float32
+    np.testing.assert_array_equal(padded, prepare(cloud, pose, CONFIG.max_points)[0])
+    np.testing.assert_array_equal(padded, hio.pad_cloud(CONFIG, padded))  # no second draw
+
+
+def test_pad_cloud_refuses_what_update_refuses():
+    with pytest.raises(ValueError, match="no finite row"):
+        hio.pad_cloud(CONFIG, np.full((3, 3), np.nan))
+    with pytest.raises(ValueError, match=r"cloud has shape \(3, 2\)"):
+        hio.pad_cloud(CONFIG, np.ones((3, 2)))
+    with pytest.raises(ValueError, match="config is int"):
+        hio.pad_cloud(3, np.ones((3, 3)))
+    with pytest.raises(ValueError, match="cloud is traced"):
+        jax.jit(lambda cloud: hio.pad_cloud(CONFIG, cloud))(np.ones((3, 3)))

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
+import flax.serialization
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+import optax
 
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.numerics.arrays import scalar
+from hiosdf_jax._src.numerics.exporting import export_optimizer, exportable
 
 NO_FEATURE = -128
 """`Derived.nearest` of a voxel without a surface patch within the distance horizon."""
@@ -20,6 +25,9 @@ FRONTIER_STEPS = 127
 
 Unknown = Literal["network", "obstacle"]
 """Policies for unseen space: the map's prediction there, or solid."""
+
+Bound = Literal["sdf", "lower"]
+"""What a planner keeps clear of: the estimated distance, or its calibrated lower bound."""
 
 
 def frontier_step_m(config: Config) -> float:
@@ -68,6 +76,7 @@ class Flag(enum.IntFlag):
         return format(str(self), spec)
 
 
+@exportable()
 class Report(flax.struct.PyTreeNode):
     """Summary of the last update; `flags` collects those of all updates.
 
@@ -101,6 +110,7 @@ class Report(flax.struct.PyTreeNode):
     flags: jax.Array
 
 
+@exportable()
 class Evidence(flax.struct.PyTreeNode):
     """What each voxel remembers of the rays that met it.
 
@@ -147,6 +157,7 @@ class Side(enum.IntEnum):
     """The same, but the patch has free space on both sides."""
 
 
+@exportable()
 class Derived(flax.struct.PyTreeNode):
     """Distances of each voxel, derived from the evidence around it.
 
@@ -170,6 +181,7 @@ class Derived(flax.struct.PyTreeNode):
     frontier_steps: jax.Array
 
 
+@exportable()
 class Grid(flax.struct.PyTreeNode):
     """The coarse global grid.
 
@@ -182,6 +194,7 @@ class Grid(flax.struct.PyTreeNode):
     derived: Derived
 
 
+@exportable()
 class Surface(flax.struct.PyTreeNode):
     """What queries read of the grid.
 
@@ -196,6 +209,7 @@ class Surface(flax.struct.PyTreeNode):
     derived: Derived
 
 
+@exportable()
 class Network(flax.struct.PyTreeNode):
     """The SIREN and its optimizer.
 
@@ -212,7 +226,32 @@ class Network(flax.struct.PyTreeNode):
     origin_world: jax.Array
 
 
-class MapState(flax.struct.PyTreeNode):
+class _FloatLeaves(flax.struct.PyTreeNode):
+    """A pytree whose float leaves can be taken apart from the others, for `jax.grad`."""
+
+    def differentiable(self) -> Self:
+        """Returns the same tree with only its float leaves; None stands for the others.
+
+        `jax.grad` takes gradients by it, and optax optimizes it, as it is.
+
+        Example:
+            >>> floats = field.differentiable()
+            >>> loss = lambda floats: hio.sdf(field.combine(floats), points).sum()
+            >>> gradient = jax.grad(loss)(floats)
+        """
+        return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jnp.floating) else None, self)
+
+    def combine(self, floats: Self) -> Self:
+        """Returns this tree with the float leaves of another, from `differentiable`."""
+        return jax.tree.map(lambda own, new: own if new is None else new, self, floats)
+
+
+def _config(fields: dict[str, Any]) -> Config:
+    return Config(**fields)
+
+
+@exportable(config=_config)
+class MapState(_FloatLeaves):
     """A map: everything that `update` needs and changes.
 
     Attributes:
@@ -235,7 +274,8 @@ class MapState(flax.struct.PyTreeNode):
     report: Report
 
 
-class Field(flax.struct.PyTreeNode):
+@exportable(config=_config)
+class Field(_FloatLeaves):
     """The part of a map that queries read; made by `snapshot`.
 
     Attributes:
@@ -257,7 +297,8 @@ class Field(flax.struct.PyTreeNode):
     stamp: jax.Array
 
 
-class Baked(flax.struct.PyTreeNode):
+@exportable(window=bool)
+class Baked(_FloatLeaves):
     """A field sampled on a lattice, for inner loops; made by `bake`.
 
     Attributes:
@@ -268,6 +309,8 @@ class Baked(flax.struct.PyTreeNode):
         lower: Lower bounds of the distance, m, (X, Y, Z) float32.
         updates: Number of updates of the map, int32.
         stamp: As in `Field`.
+        window: Whether it covers a part of the map; static, not a leaf. Outside of it no distance
+            is more than what the window implies.
     """
 
     corner_world: jax.Array
@@ -277,8 +320,10 @@ class Baked(flax.struct.PyTreeNode):
     lower: jax.Array
     updates: jax.Array
     stamp: jax.Array
+    window: bool = flax.struct.field(pytree_node=False, default=False)
 
 
+@exportable()
 class Query(NamedTuple):
     """The answer of `query` at points.
 
@@ -290,6 +335,7 @@ class Query(NamedTuple):
             positive in such voxels.
         lower: At most the true distance at about 99 % of the points of free space, (...) float32,
             m. It is calibrated on each new cloud, not guaranteed, and counts unseen space as solid.
+        lower_grad: d(lower)/d(point), (..., 3) float32.
     """
 
     sdf: jax.Array
@@ -297,12 +343,52 @@ class Query(NamedTuple):
     observed: jax.Array
     frontier: jax.Array
     lower: jax.Array
+    lower_grad: jax.Array
 
 
-def check_map(state: Any) -> None:
-    """Raises a ValueError if an argument named `state` is not a map."""
+export_optimizer(optax.ScaleByAdamState, optax.EmptyState)
+
+
+def _to_flax(state: MapState) -> dict[str, Any]:
+    """Writes a map for `flax.serialization`, which cannot write typed keys."""
+    data = {k: v for k, v in vars(state).items() if k != "config"}
+    data["key"] = jax.random.key_data(state.key)
+    return {name: flax.serialization.to_state_dict(value) for name, value in data.items()}
+
+
+def _from_flax(state: MapState, data: dict[str, Any]) -> MapState:
+    own = {k: v for k, v in vars(state).items() if k != "config"}
+    own["key"] = jax.random.key_data(state.key)
+    read = flax.serialization.from_state_dict(own, data)
+    read["key"] = jax.random.wrap_key_data(read["key"], impl=jax.random.key_impl(state.key))
+    return state.replace(**read)
+
+
+flax.serialization.register_serialization_state(MapState, _to_flax, _from_flax, override=True)
+
+
+def check_map(state: Any, stacked: bool = False) -> None:
+    """Raises a ValueError if an argument named `state` is not a map, or not a single one."""
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    if not stacked:
+        check_single("state", state)
+
+
+def check_single(name: str, field: MapState | Field | Baked) -> None:
+    """Raises a ValueError if an argument is a stack of maps, outside `jax.vmap`."""
+    voxels = field.sdf if isinstance(field, Baked) else _derived(field).sdf
+    axes = np.ndim(voxels) - 3
+    if axes:
+        raise ValueError(
+            f"{name} has voxels of shape {np.shape(voxels)}, expected those of one map: for "
+            f"{np.shape(voxels)[0]} maps at once use jax.vmap, for example "
+            f"jax.vmap(hio.sdf, in_axes=(0, None))(fields, points)"
+        )
+
+
+def _derived(field: MapState | Field) -> Derived:
+    return field.grid.derived if isinstance(field, MapState) else field.surface.derived
 
 
 def surface_of(grid: Grid) -> Surface:
@@ -319,5 +405,5 @@ def field_of(state: MapState) -> Field:
         surface=surface_of(state.grid),
         optimism=state.optimism,
         updates=state.updates,
-        stamp=jnp.zeros((), jnp.float32),
+        stamp=scalar(0),
     )

@@ -14,6 +14,7 @@ from hiosdf_jax._src.change import directions
 from hiosdf_jax._src.change.piercing import find_piercing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.state import Grid
 
 # The map can judge a cloud after this many updates. It looks at about this many rays.
@@ -109,7 +110,7 @@ def judge(
         return jnp.float32(directions.UNKNOWN), jnp.float32(directions.UNKNOWN)
 
     suspicious = (updates >= _CONFIDENT_UPDATES) & exceeds(_NOISE_WRONG, _LEAST_NOISE_WRONG)
-    smooth, smooth_novel = jax.lax.cond(suspicious, look, skip, rays)
+    smooth, smooth_novel = cond(suspicious, look, skip, rays)
     noise = suspicious & (smooth != directions.UNKNOWN) & (smooth < _LEAST_SMOOTH)
     fills_view = (
         (smooth_novel >= _LEAST_SMOOTH)

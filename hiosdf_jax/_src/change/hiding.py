@@ -12,6 +12,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, is_observed
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 from hiosdf_jax._src.numerics.vectors import length, split
 
@@ -120,5 +121,5 @@ def hide_behind(
         return jnp.where(unmet & shown & ~behind, jnp.abs(passes), passes)
 
     needed = jnp.any(fresh) | jnp.any(before.passes < 0)
-    passes = jax.lax.cond(needed, hide, lambda window: window.passes, window)
+    passes = cond(needed, hide, lambda window: window.passes, window)
     return window._replace(passes=passes)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state import Grid
 
@@ -50,8 +51,8 @@ def find_piercing(config: Config, grid: Grid, rays: Rays) -> jax.Array:
         return along + step, met
 
     count = rays.in_range.shape[0]
-    start = jnp.full(count, config.min_range, jnp.float32)
-    _, met = jax.lax.fori_loop(0, _STEPS, advance, (start, jnp.full(count, -1, jnp.int32)))
+    start = jnp.full(count, config.min_range, jnp.float32), jnp.full(count, -1, jnp.int32)
+    _, met = jax.lax.fori_loop(0, _STEPS, advance, varying_like(start, sdf, rays))
     x, y, z = jnp.unravel_index(jnp.maximum(met, 0), shape)
     patch = lookup.patch_voxel(config, derived, (x, y, z))
     new = grid.evidence.change.ravel()[patch] > 0

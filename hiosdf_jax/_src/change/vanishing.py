@@ -14,6 +14,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
 
@@ -126,7 +127,7 @@ def drop_vanished(
         return jax.lax.fori_loop(0, _SPREADS, once, vanished)
 
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_NEIGHBORS
-    vanished = jax.lax.cond(many, spread, lambda vanished: vanished, vanished)
+    vanished = cond(many, spread, lambda vanished: vanished, vanished)
     window = window._replace(change=put(change, counted))
     return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
 

@@ -12,8 +12,10 @@ import numpy as np
 
 from hiosdf_jax._src.field.lattice import sample_counts
 from hiosdf_jax._src.field.points import query
-from hiosdf_jax._src.numerics.intake import as_array, as_real, is_traced
-from hiosdf_jax._src.state import Baked, Field, MapState, field_of
+from hiosdf_jax._src.numerics.arrays import on_device, scalar
+from hiosdf_jax._src.numerics.intake import as_real, is_traced
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.state import Baked, Field, MapState, check_single, field_of
 
 _CHUNK = 65536  # samples at a time: activations are many times larger than a sample
 
@@ -49,26 +51,28 @@ def bake(
         field = field_of(field)
     if not isinstance(field, Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    check_single("field", field)
     if (center is None) != (size is None):
         raise ValueError("center and size define a window, expected both or neither")
     if size is None:
         low, high = np.asarray(field.config.bounds)
-        size, corner_world = high - low, jnp.asarray(low, jnp.float32)
+        window, size, corner_world = False, high - low, on_device("bounds", low)
     else:
-        size = as_real("size", size).astype(float)
+        window, size = True, as_real("size", size).astype(float)
         if size.shape != (3,) or not (np.isfinite(size).all() and (size > 0).all()):
             raise ValueError(f"size is {size}, expected three lengths > 0, m")
-        center = jnp.asarray(as_array("center", center))
+        center = on_device("center", center)
         if center.shape != (3,):
             raise ValueError(f"center has shape {center.shape}, expected (3,)")
         if not is_traced(center) and not np.isfinite(center).all():
             raise ValueError(f"center is {center}, expected finite coordinates, m")
-        corner_world = center - jnp.asarray(size / 2, jnp.float32)
-    shape = sample_counts(size, resolution)
-    return _bake(field, corner_world, jnp.float32(resolution), shape)
+        corner_world = center - on_device("size", size / 2)
+    counts = sample_counts(size, resolution)
+    return _bake(field, corner_world, scalar(resolution), counts).replace(window=window)
 
 
 @functools.partial(jax.jit, static_argnums=3)
+@plain
 def _bake(
     field: Field, corner_world: jax.Array, resolution: jax.Array, shape: tuple[int, int, int]
 ) -> Baked:

@@ -13,6 +13,7 @@ from hiosdf_jax._src.field.lattice import check_resolution
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.state import Field, MapState, field_of
 
 if TYPE_CHECKING:
@@ -91,4 +92,4 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     )
 
 
-_move = jax.jit(lookup.move_to_surface, static_argnums=0)
+_move = jax.jit(plain(lookup.move_to_surface), static_argnums=0)

@@ -11,9 +11,19 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.field import blend, lattice
 from hiosdf_jax._src.grid.geometry import clip_to_box
+from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.numerics.intake import as_array
-from hiosdf_jax._src.state import Baked, Field, MapState, Query, Unknown, field_of
+from hiosdf_jax._src.numerics.modes import pointwise
+from hiosdf_jax._src.state import (
+    Baked,
+    Bound,
+    Field,
+    MapState,
+    Query,
+    Unknown,
+    check_single,
+    field_of,
+)
 
 _FAR = 1e30  # m
 
@@ -27,8 +37,9 @@ AnyField = MapState | Field | Baked
 def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array:
     """Computes the signed distance to the nearest surface.
 
-    Outside the bounds it is the distance to the box plus the value at the box's nearest point. NaN
-    points return -1e30, i.e. in collision, so that a diverged rollout is never safe.
+    Outside the bounds it is the distance to the box plus the value at the box's nearest point.
+    Outside a baked window, where a surface may be anywhere, the distance to it is subtracted
+    instead. NaN points return -1e30, i.e. in collision, so that a diverged rollout is never safe.
 
     Args:
         field: A map, a snapshot of one, or a baked field.
@@ -47,7 +58,7 @@ def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array
     Example:
         >>> clearance = hio.sdf(field, points, unknown="obstacle") - robot_radius
     """
-    return _distance(as_field(field), _checked(points, unknown), unknown)
+    return distance(field, points, unknown, "sdf")
 
 
 def sdf_and_grad(
@@ -69,7 +80,7 @@ def sdf_and_grad(
     Example:
         >>> distance, gradient = hio.sdf_and_grad(field, points)
     """
-    return _distance_and_grad(as_field(field), _checked(points, unknown), unknown)
+    return distance_and_grad(field, points, unknown, "sdf")
 
 
 def query(field: AnyField, points: Any, unknown: Unknown = "network") -> Query:
@@ -89,7 +100,36 @@ def query(field: AnyField, points: Any, unknown: Unknown = "network") -> Query:
     Example:
         >>> safe = hio.query(field, points).lower > robot_radius
     """
-    return _query(as_field(field), _checked(points, unknown), unknown)
+    points = _checked(points, unknown, "sdf")
+    return _query(as_field(field), points, unknown=unknown)
+
+
+def distance(field: AnyField, points: Any, unknown: Unknown, bound: Bound) -> jax.Array:
+    """Computes the distance that planning asks for: the estimate, or its lower bound.
+
+    Args:
+        field: A map, a snapshot of one, or a baked field.
+        points: (..., 3) m, world frame.
+        unknown: As for `sdf`.
+        bound: "sdf" for the estimate, "lower" for `Query.lower`. With unknown="obstacle" either is
+            at most the frontier's distance.
+
+    Returns:
+        (...) float32, m. Differentiable.
+
+    Raises:
+        ValueError: An argument has a wrong type, shape or value.
+    """
+    points = _checked(points, unknown, bound)
+    return _distance(as_field(field), points, unknown=unknown, bound=bound)
+
+
+def distance_and_grad(
+    field: AnyField, points: Any, unknown: Unknown, bound: Bound
+) -> tuple[jax.Array, jax.Array]:
+    """Computes `distance` and its gradient (..., 3), by one reverse-mode evaluation."""
+    points = _checked(points, unknown, bound)
+    return _distance_and_grad(as_field(field), points, unknown=unknown, bound=bound)
 
 
 def as_field(field: AnyField) -> Field | Baked:
@@ -102,40 +142,63 @@ def as_field(field: AnyField) -> Field | Baked:
         A field or a baked field.
 
     Raises:
-        ValueError: The argument is something else.
+        ValueError: The argument is something else, or a stack of maps outside `jax.vmap`.
     """
-    if isinstance(field, Field | Baked):
-        return field
     if isinstance(field, MapState):
-        return field_of(field)
-    raise ValueError(f"field is {type(field).__name__}, expected a MapState, a Field or a Baked")
+        field = field_of(field)
+    if not isinstance(field, Field | Baked):
+        raise ValueError(
+            f"field is {type(field).__name__}, expected a MapState, a Field or a Baked"
+        )
+    check_single("field", field)
+    return field
 
 
 # Compiled functions of their own, so that a call outside jit is one dispatch.
-_compiled = functools.partial(jax.jit, static_argnames="unknown")
+_compiled = functools.partial(jax.jit, static_argnames=("unknown", "bound"))
 
 
-@_compiled
+@functools.partial(jax.jit, static_argnames="unknown")
+@pointwise
 def _query(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
-    value, gradient = _distance_and_grad(field, points, unknown)
+    points = _clipped(points)
     place = _place(field, points)
     frontier = _frontier(field, place)
-    lower = _answers_of(field).lower(field, place.nearest) - place.beyond
-    return Query(value, gradient, frontier > 0, frontier, lower)
+    sdf, grad = _with_gradient(field, points, unknown, "sdf")
+    lower, lower_grad = _with_gradient(field, points, "network", "lower")
+    return Query(sdf, grad, frontier > 0, frontier, lower, lower_grad)
 
 
 @_compiled
+@pointwise
 def _distance_and_grad(
-    field: Field | Baked, points: jax.Array, unknown: Unknown
+    field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound
 ) -> tuple[jax.Array, jax.Array]:
-    return value_and_gradient(lambda points: _distance(field, points, unknown), points)
+    return _with_gradient(field, _clipped(points), unknown, bound)
 
 
 @_compiled
-def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown) -> jax.Array:
+@pointwise
+def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound) -> jax.Array:
+    return _value(field, _clipped(points), unknown, bound)
+
+
+def _with_gradient(
+    field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound
+) -> tuple[jax.Array, jax.Array]:
+    return value_and_gradient(lambda points: _value(field, points, unknown, bound), points)
+
+
+def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound) -> jax.Array:
     place = _place(field, points)
-    value = _answers_of(field).sdf(field, place.nearest, unknown)
-    value = value + jnp.where(jnp.any(jnp.isnan(points), axis=-1), -place.beyond, place.beyond)
+    answers = _answers_of(field)
+    if bound == "lower":
+        value = answers.lower(field, place.nearest) - place.beyond
+    else:
+        value = answers.sdf(field, place.nearest, unknown)
+        # Outside a window the map may have a surface that the window does not know.
+        nearer = jnp.any(jnp.isnan(points), axis=-1) | (isinstance(field, Baked) and field.window)
+        value = value + jnp.where(nearer, -place.beyond, place.beyond)
     if unknown == "network":
         return value
     frontier = _frontier(field, place)
@@ -177,11 +240,17 @@ def _place(field: Field | Baked, points: jax.Array) -> _Place:
     return _Place(nearest, jnp.where(outside, scale * jnp.sqrt(jnp.where(outside, square, 1)), 0))
 
 
-def _checked(points: Any, unknown: Any) -> jax.Array:
+def _checked(points: Any, unknown: Any, bound: Any) -> jax.Array:
     if not (isinstance(unknown, str) and unknown in ("network", "obstacle")):
         raise ValueError(f"unknown is {unknown!r}, expected 'network' or 'obstacle'")
-    points = jnp.asarray(as_array("points", points))
+    if not (isinstance(bound, str) and bound in ("sdf", "lower")):
+        raise ValueError(f"bound is {bound!r}, expected 'sdf' or 'lower'")
+    points = on_device("points", points)
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points has shape {points.shape}, expected (..., 3)")
-    # Infinite points count as very far: inf - inf would be NaN.
+    return points
+
+
+def _clipped(points: jax.Array) -> jax.Array:
+    """Makes infinite points very far ones: inf - inf would be NaN."""
     return jnp.clip(points, -_FAR, _FAR)

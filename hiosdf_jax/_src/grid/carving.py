@@ -14,6 +14,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import split
 
 # Passes stop this far (voxels) before the end of the ray. Measured on a depth stream: 0.78 cm with
@@ -64,7 +65,7 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
     _, passes = jax.lax.while_loop(
         lambda carry: carry[0] < longest,
         advance,
-        (jnp.float32(0), jnp.zeros(voxels, window.passes.dtype)),
+        varying_like((jnp.float32(0), jnp.zeros(voxels, window.passes.dtype)), rays, window),
     )
     passes = passes.reshape(shape)
     # A hidden voxel (negative) that rays pass again is observed.

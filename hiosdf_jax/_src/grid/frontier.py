@@ -10,6 +10,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
 
@@ -50,7 +51,9 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
             best = jnp.minimum(best, across + (k.astype(jnp.float32) - 0.5) ** 2)
         return best
 
-    return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, squared)
+    return jax.lax.fori_loop(
+        np.int32(1), np.int32(reach + 1), compare, varying_like(squared, inside)
+    )
 
 
 def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:

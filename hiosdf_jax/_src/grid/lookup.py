@@ -76,7 +76,7 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
         points_world: (..., 3) m; points outside the bounds take the border's value.
 
     Returns:
-        The mean of the nearest patches; its distance is differentiable by the points.
+        The mean of the nearest patches. Differentiable by the points.
     """
     points_world = geometry.clamp(config, points_world)
     corners = geometry.corners_of(config, points_world)
@@ -101,9 +101,7 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     total = jnp.where(any_found, jnp.sum(weight, axis=0), 1)
     sdf_m = jnp.sum(weight * value, axis=0) / total * config.voxel_size
     spread_m = jnp.sum(weight * patch.spread, axis=0) / total * config.voxel_size
-    return Nearest(
-        jnp.where(any_found, sdf_m, config.distance_horizon), jax.lax.stop_gradient(spread_m)
-    )
+    return Nearest(jnp.where(any_found, sdf_m, config.distance_horizon), spread_m)
 
 
 class OnSurface(NamedTuple):

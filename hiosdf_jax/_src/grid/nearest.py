@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
 
 _INFINITE = 1e12  # squared voxels
@@ -150,6 +151,7 @@ def _transform_axis(
 
     cut = (rows[0], length, rows[2])
     results = (jnp.zeros(cut, squared.dtype), jnp.zeros(cut, jnp.int32))
+    results = varying_like(results, squared, along)
     best, shift = jax.lax.fori_loop(0, blocks, transform, results)
     cut = (*shape[:axis], length, *shape[axis + 1 :])
     return best.reshape(cut), shift.reshape(cut)
@@ -173,5 +175,5 @@ def _transform_block(
         return best, shift
 
     unroll = 1 if jax.default_backend() == "cpu" else _UNROLL
-    start = (best, jnp.zeros(best.shape, jnp.int32))
+    start = varying_like((best, jnp.zeros(best.shape, jnp.int32)), squared, along)
     return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, start, unroll=unroll)

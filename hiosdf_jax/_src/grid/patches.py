@@ -14,6 +14,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
 
 # Half extent of a patch along a principal axis, in standard deviations. Uniform hits have sqrt(3);
@@ -235,7 +236,7 @@ def principal_axes(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
                 v[p][k], v[q][k] = c * v[p][k] - s * v[q][k], s * v[p][k] + c * v[q][k]
         return a, v
 
-    a, v = jax.lax.fori_loop(0, _JACOBI_SWEEPS, sweep, (a, v))
+    a, v = jax.lax.fori_loop(0, _JACOBI_SWEEPS, sweep, varying_like((a, v), a))
     value = jnp.stack([a[0, 0], a[1, 1], a[2, 2]], axis=-1)
     vector = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
     order = jnp.argsort(-value, axis=-1)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import length, split
 
 # Noise moves returns off the robot. They count as on it up to this distance from its spheres, m, or
@@ -105,5 +106,6 @@ def remove_robot(rays: Rays, centers_world: jax.Array, radii: jax.Array) -> Rays
         distance = length(split(rays.points_world - center))
         return found | (distance <= radius + margin), None
 
-    found, _ = jax.lax.scan(add, jnp.zeros(rays.ends.shape, bool), (centers_world, radii))
+    start = varying_like(jnp.zeros(rays.ends.shape, bool), rays, centers_world, radii)
+    found, _ = jax.lax.scan(add, start, (centers_world, radii))
     return rays._replace(in_range=rays.in_range & ~found, ends=rays.ends & ~found)

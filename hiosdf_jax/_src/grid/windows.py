@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
+from hiosdf_jax._src.numerics.modes import cond
 
 # A cloud that fills less than this share of the range in each direction, such as that of a camera
 # or of a sensor in a small room, uses a window that is smaller by the same share.
@@ -122,4 +123,4 @@ def recompute[T](
     small, large, fits = place_windows(config, box, horizon_m)
     if (small.shape, small.inner_shape) == (large.shape, large.inner_shape):
         return function(large)
-    return jax.lax.cond(fits, lambda: function(small), lambda: function(large))
+    return cond(fits, lambda: function(small), lambda: function(large))

@@ -14,6 +14,7 @@ from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.numerics.intake import as_floats, is_traced
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.state import Evidence, Grid, MapState, check_map
 
 
@@ -50,6 +51,7 @@ def forget(state: MapState, box: Any) -> MapState:
 
 
 @jax.jit(static_argnums=0)
+@plain
 def _forget(config: Config, grid: Grid, corners: jax.Array) -> Grid:
     center_world = geometry.window_centers(config, jnp.zeros(3, jnp.int32), config.grid_shape)
     inside = jnp.all((center_world >= corners[0]) & (center_world <= corners[1]), axis=-1)

@@ -10,6 +10,7 @@ import numpy as np
 
 from hiosdf_jax._src.mapping.stages import CHECKS, begin, run_stages
 from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.posed_cloud import as_traced, check_extras, check_pose, checked_cloud
 from hiosdf_jax._src.state import MapState, check_map
 
@@ -64,6 +65,7 @@ def moving_rows(
     return _moving_rows_jit(state, padded, matrix, *extras)[:rows]
 
 
+@plain
 def _moving_rows(
     state: MapState,
     cloud: jax.Array,

@@ -21,10 +21,15 @@ from hiosdf_jax._src.mapping.stages import (
     run_stages,
 )
 from hiosdf_jax._src.network.training import init_network
-from hiosdf_jax._src.numerics.intake import as_array, is_traced
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
     as_traced,
     check_extras,
+    check_pose,
+    checked_cloud,
+    pad_rows,
     prepare,
     warn_out_of_range,
     warn_outside,
@@ -140,7 +145,37 @@ def update(
     limits = (config.min_range, config.max_range, config.min_in_range)
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
-    return compiled(state, cloud, pose, *extras)
+    return compiled(state, jax.device_put(cloud), jax.device_put(pose), *extras)
+
+
+def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
+    """Brings a cloud to `config.max_points` rows, as `update` does outside jit.
+
+    In a loop inside `jit`, clouds of other sizes would compile `update` again. Pad them first.
+
+    Args:
+        config: The map's configuration.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns. Not inside jit.
+        pose: The cloud's pose, (4, 4). It matters for clouds of more than `max_points` rows: with
+            it, the same rows are drawn as by `update`.
+
+    Returns:
+        (max_points, 3) float32: the cloud and rows of NaN, or rows of it, drawn at random.
+
+    Raises:
+        ValueError: An argument has a wrong type or shape, or the cloud has no finite row.
+
+    Example:
+        >>> clouds = jnp.stack([hio.pad_cloud(config, cloud) for cloud in clouds])
+        >>> step = lambda state, frame: (hio.update(state, *frame), None)
+        >>> state, _ = jax.lax.scan(step, state, (clouds, poses))
+    """
+    if not isinstance(config, Config):
+        raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
+    if is_traced(cloud):
+        raise ValueError("cloud is traced, expected concrete numbers: call pad_cloud outside jit")
+    pose = None if pose is None else check_pose(pose)
+    return pad_rows(checked_cloud(cloud), config.max_points, pose)
 
 
 def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
@@ -157,13 +192,13 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
     Raises:
         ValueError: `state` is not a map, or `stamp` is not one number, finite in float32.
     """
-    check_map(state)
-    seconds = as_array("stamp", stamp)
-    known = isinstance(seconds, jax.Array) or np.isfinite(seconds).all()  # nothing waits for it
+    check_map(state, stacked=True)
+    seconds = on_device("stamp", stamp)
+    known = isinstance(stamp, jax.Array) or np.isfinite(seconds)  # nothing waits for it
     if seconds.shape != () or not known:
         raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
     field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=jnp.asarray(seconds))
+    return field.replace(stamp=seconds)
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
@@ -200,6 +235,7 @@ def grow(state: MapState, bounds: Any) -> MapState:
     return rest.replace(config=new, grid=grid)
 
 
+@plain
 def _update(
     state: MapState,
     cloud: jax.Array,
@@ -211,7 +247,7 @@ def _update(
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     step = run_stages(begin(state, cloud, finite, pose, robot, noise), CHECKS)
-    return jax.lax.cond(
+    return cond(
         is_accepted(step),
         lambda _, step: run_stages(step, FUSION).state,
         refuse,

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.network.fast_sine import sine_and_cosine
+from hiosdf_jax._src.numerics.modes import plain
 
 Layer = tuple[jax.Array, jax.Array]  # kernel, bias
 
@@ -108,7 +109,7 @@ def _product_backward(residual: Any, upstream: jax.Array) -> tuple[jax.Array, ja
     return _dot(upstream, kernel.T, stored_dtype()).astype(like.dtype), by_kernel
 
 
-_product.defvjp(_product_forward, _product_backward)
+_product.defvjp(plain(_product_forward), plain(_product_backward))
 
 
 def _dot(x: jax.Array, kernel: jax.Array, dtype: Any) -> jax.Array:
@@ -137,7 +138,7 @@ def _activation_backward(residual: Any, upstream: Any) -> tuple[None, jax.Array]
     return None, by_sine * cosine - frequency**2 * by_cosine * sine
 
 
-_activation.defvjp(_activation_forward, _activation_backward)
+_activation.defvjp(plain(_activation_forward), plain(_activation_backward))
 
 
 def _activate(frequency: float, z: jax.Array) -> tuple[jax.Array, jax.Array]:

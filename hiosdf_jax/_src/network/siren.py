@@ -14,6 +14,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.network import hopper, tiles
 from hiosdf_jax._src.network.fast_sine import sine
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
+from hiosdf_jax._src.numerics.modes import plain
 
 
 class Siren(nn.Module):
@@ -72,6 +73,7 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
 
 
 @functools.partial(predict.defjvp, symbolic_zeros=True)
+@plain
 def _predict_jvp(config: Config, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     (params, points), (by_params, by_points) = primals, tangents
     if not _all_zero(by_params):
@@ -100,6 +102,7 @@ def predict_with_gradient(
 
 
 @predict_with_gradient.defjvp
+@plain
 def _predict_with_gradient_jvp(config: Config, primals: Any, tangents: Any) -> Any:
     def plain(params: Any, points: jax.Array) -> tuple[jax.Array, jax.Array]:
         return value_and_gradient(

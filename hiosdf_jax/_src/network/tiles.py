@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,7 +24,12 @@ _MOST_PADDING = 1.03  # more rows than that cost more than the copies
 
 
 def tile_count(rows: int) -> int:
-    """Returns the number of tiles for a number of rows on the default device."""
+    """Returns the number of tiles for a number of rows on the default device.
+
+    A number that `jax.export` leaves open makes one tile.
+    """
+    if jax.export.is_symbolic_dim(rows):
+        return 1
     return -(-rows // _ROWS) if jax.default_backend() == "cpu" else 1
 
 

@@ -13,6 +13,7 @@ import optax
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.network import forward, siren, tiles
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.samples.draw import Samples
 from hiosdf_jax._src.state import Network
 
@@ -137,7 +138,7 @@ def train(
             part = jax.grad(objective, has_aux=True)(params, tile, weights)
             return jax.tree.map(jnp.add, total, part), None
 
-        nothing = jax.tree.map(jnp.zeros_like, (params, weights))
+        nothing = varying_like(jax.tree.map(jnp.zeros_like, (params, weights)), params, batch)
         (gradients, sums), _ = jax.lax.scan(add, nothing, batch)
         gradients = jax.tree.map(lambda gradient: gradient / _count(weights), gradients)
         updates, state = optimizer.update(gradients, state, params)
@@ -148,6 +149,7 @@ def train(
         return params, state, jax.tree.map(jnp.mean, parts)
 
     start = (network.params, network.optimizer, Losses(jnp.float32(0), jnp.float32(0)))
+    start = varying_like(start, network, batches, extra_epochs)
     least = least_epochs(config)
     if jax.default_backend() == "cpu":
         params, state, parts = jax.lax.fori_loop(0, least + extra_epochs, epoch, start)

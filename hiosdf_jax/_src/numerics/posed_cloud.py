@@ -173,8 +173,7 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
     Args:
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
         pose: (4, 4) T_world_sensor.
-        capacity: Rows of the result. Smaller clouds are padded with NaN; larger ones are drawn from
-            at random.
+        capacity: Rows of the result, see `pad_rows`.
 
     Returns:
         The cloud (capacity, 3) and the pose, float32.
@@ -184,6 +183,24 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
             finite row.
     """
     cloud, pose = checked_cloud(cloud), check_pose(pose)
+    return pad_rows(cloud, capacity, pose), pose
+
+
+def pad_rows(cloud: np.ndarray, capacity: int, pose: np.ndarray | None = None) -> np.ndarray:
+    """Brings a cloud to a fixed shape.
+
+    Args:
+        cloud: (N, 3) float32, m; rows with a NaN or inf are no returns.
+        capacity: Rows of the result. Smaller clouds are padded with NaN; larger ones are drawn from
+            at random.
+        pose: (4, 4) float32; other poses draw other rows.
+
+    Returns:
+        (capacity, 3) float32.
+
+    Raises:
+        ValueError: The shape is wrong, or the cloud has no finite row.
+    """
     finite = finite_rows(cloud)
     padded = np.empty((capacity, 3), np.float32)
     count = len(cloud)
@@ -191,12 +208,13 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         padded[:count] = cloud
     else:
         # The draw must be a function of the arguments, and differ from cloud to cloud.
-        seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), zlib.crc32(pose.tobytes()))
+        start = 0 if pose is None else zlib.crc32(pose.tobytes())
+        seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), start)
         rows = _draw(finite, seed, capacity)
         count = len(rows)
         np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" copies twice
     padded[count:] = np.nan
-    return padded, pose
+    return padded
 
 
 def warn_out_of_range(

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.numerics.modes import cond
+
 
 class Padded(NamedTuple):
     """An array with a margin at both ends of one axis.
@@ -59,4 +61,4 @@ def with_neighbors(mask: jax.Array) -> jax.Array:
             mask = mask | padded.shifted(-1) | padded.shifted(1)
         return mask
 
-    return jax.lax.cond(jnp.any(mask), grow, lambda mask: mask, mask)
+    return cond(jnp.any(mask), grow, lambda mask: mask, mask)

@@ -8,12 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, sdf, sdf_and_grad
-from hiosdf_jax._src.numerics.intake import as_array, is_traced
+from hiosdf_jax._src.field.points import AnyField, Unknown, distance, distance_and_grad
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.state import Bound
+
+_FAR = 1e30  # m
 
 
+@plain
 def sphere_clearance(
-    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
+    field: AnyField,
+    centers_world: Any,
+    radii: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> jax.Array:
     """Computes the signed distance of spheres to the nearest surface: sdf(center) - radius.
 
@@ -27,6 +37,8 @@ def sphere_clearance(
         radii: m, >= 0; any shape that broadcasts to that of the spheres, (...).
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         (...) float32, m; negative in collision, by the depth of penetration. Differentiable.
@@ -35,11 +47,16 @@ def sphere_clearance(
         ValueError: A shape is wrong, or (outside jit) a radius is negative or not finite.
     """
     centers, radii = checked_spheres(centers_world, radii, "centers_world")
-    return sdf(field, centers, unknown) - radii
+    return distance(field, centers, unknown, bound) - radii
 
 
+@plain
 def sphere_clearance_and_grad(
-    field: AnyField, centers_world: Any, radii: Any, unknown: Unknown = "obstacle"
+    field: AnyField,
+    centers_world: Any,
+    radii: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> tuple[jax.Array, jax.Array]:
     """Computes the clearance of spheres and its gradient, by one reverse-mode evaluation.
 
@@ -49,6 +66,8 @@ def sphere_clearance_and_grad(
         radii: As for `sphere_clearance`.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         The clearance (...) float32, m, and d(clearance)/d(center), (..., 3) float32.
@@ -57,7 +76,7 @@ def sphere_clearance_and_grad(
         ValueError: As for `sphere_clearance`.
     """
     centers, radii = checked_spheres(centers_world, radii, "centers_world")
-    value, gradient = sdf_and_grad(field, centers, unknown)
+    value, gradient = distance_and_grad(field, centers, unknown, bound)
     return value - radii, gradient
 
 
@@ -70,17 +89,19 @@ def checked_spheres(centers: Any, radii: Any, name: str) -> tuple[jax.Array, jax
         name: The caller's name for the centers.
 
     Returns:
-        The centers and the radii, float32.
+        The centers and the radii, float32; traced radii that are negative or not finite become
+        1e30 m.
 
     Raises:
         ValueError: A type or a shape is wrong, or (outside jit) a radius is negative or not finite.
     """
-    centers, radii = as_array(name, centers), as_array("radii", radii)
+    centers, radii = on_device(name, centers), on_device("radii", radii)
     shape = centers.shape
     if not shape or shape[-1] != 3:
         raise ValueError(f"{name} has shape {shape}, expected (..., 3)")
-    if not is_traced(radii):
-        values = np.asarray(radii)
+    traced = is_traced(radii)
+    if not traced:
+        values = np.asarray(jax.device_get(radii))
         wrong = ~((values >= 0) & np.isfinite(values))
         if wrong.any():
             raise ValueError(
@@ -95,4 +116,5 @@ def checked_spheres(centers: Any, radii: Any, name: str) -> tuple[jax.Array, jax
             f"radii has shape {radii.shape}, expected one that broadcasts to {shape[:-1]}, "
             f"the spheres of {name}"
         )
-    return jnp.asarray(centers), jnp.asarray(radii)
+    # Inside jit a radius that is no radius is in collision: NaN would compare as clear.
+    return centers, jnp.where((radii >= 0) & (radii <= _FAR), radii, _FAR) if traced else radii

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.intake import as_array, is_traced
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.modes import plain
 
 
 def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
@@ -34,11 +36,17 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
     Raises:
         ValueError: (Outside jit) the margin is not positive and finite.
     """
-    clearance, margin = as_array("clearance", clearance), as_array("margin_m", margin_m)
+    clearance, margin = on_device("clearance", clearance), on_device("margin_m", margin_m)
     if not is_traced(margin):
-        values = np.asarray(margin)
+        values = np.asarray(jax.device_get(margin))
         if not ((values > 0) & np.isfinite(values)).all():
             raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite")
+    return _cost(clearance, margin)
+
+
+@jax.jit
+@plain
+def _cost(clearance: jax.Array, margin: jax.Array) -> jax.Array:
     # Clipped before squaring: an infinite clearance must not make the gradient NaN.
     shortfall = jnp.clip(margin - clearance, 0, margin)
     return shortfall**2 / (2 * margin) + jnp.maximum(-clearance, 0)

@@ -8,10 +8,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, sdf_and_grad
+from hiosdf_jax._src.field.points import AnyField, Unknown, distance_and_grad
+from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import least
-from hiosdf_jax._src.numerics.intake import as_array, as_number, check_whole, is_traced
+from hiosdf_jax._src.numerics.intake import as_number, check_whole, is_traced
+from hiosdf_jax._src.numerics.modes import plain, varying_like
 from hiosdf_jax._src.numerics.vectors import length, split
+from hiosdf_jax._src.state import Bound
 
 # Samples per segment that are held off the map; the last one is the segment's end.
 _SAMPLES_PER_SEGMENT = 4
@@ -34,6 +37,7 @@ class Trajectory(NamedTuple):
     length: jax.Array
 
 
+@plain
 def waves(
     key: jax.Array, start_world: Any, goal_world: Any, count: int, waypoints: int, spread_m: float
 ) -> jax.Array:
@@ -56,7 +60,7 @@ def waves(
     Raises:
         ValueError: A shape or a type is wrong, or a number is out of range.
     """
-    start, goal = as_array("start_world", start_world), as_array("goal_world", goal_world)
+    start, goal = on_device("start_world", start_world), on_device("goal_world", goal_world)
     for name, ends in (("start_world", start), ("goal_world", goal)):
         if ends.shape != (3,):
             raise ValueError(f"{name} has shape {ends.shape}, expected (3,)")
@@ -64,13 +68,13 @@ def waves(
     check_whole("waypoints", waypoints, 2)
     if not is_traced(spread_m):
         spread_m = as_number("spread_m", spread_m, 0)
-    along = jnp.linspace(0, 1, waypoints)[:, None]
-    heights = spread_m * jax.random.normal(key, (count, 3, 3)).at[0].set(0)
-    shapes = jnp.sin(jnp.pi * along * jnp.arange(1, 4))
-    start, goal = jnp.asarray(start), jnp.asarray(goal)
+    along = jnp.linspace(0, 1, waypoints, dtype=jnp.float32)[:, None]
+    heights = spread_m * jax.random.normal(key, (count, 3, 3), jnp.float32).at[0].set(0)
+    shapes = jnp.sin(jnp.pi * along * jnp.arange(1, 4, dtype=jnp.float32))
     return start + along * (goal - start) + shapes @ heights
 
 
+@plain
 def optimize_trajectory(
     field: AnyField,
     initial_world: Any,
@@ -80,6 +84,7 @@ def optimize_trajectory(
     steps: int = 300,
     step_m: float = 0.05,
     unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> Trajectory:
     """Shortens paths and pushes them off the map, by Adam on the map's distances and gradients.
 
@@ -105,6 +110,8 @@ def optimize_trajectory(
         step_m: Adam's learning rate, about the most that a waypoint moves per step. It decays.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         The optimized paths, one per guess.
@@ -112,7 +119,7 @@ def optimize_trajectory(
     Raises:
         ValueError: `initial_world` has a wrong shape or type, or a number is out of range.
     """
-    initial = jnp.asarray(as_array("initial_world", initial_world))
+    initial = on_device("initial_world", initial_world)
     if initial.ndim < 2 or initial.shape[-1] != 3 or initial.shape[-2] < 3:
         raise ValueError(f"initial_world has shape {initial.shape}, expected (..., N >= 3, 3)")
     radius_m, margin_m = as_number("radius_m", radius_m, 0), as_number("margin_m", margin_m, 0)
@@ -122,11 +129,11 @@ def optimize_trajectory(
     wanted = radius_m + margin_m
     segments = initial.shape[-2] - 1
     straight = jnp.maximum(length(split(initial[..., -1, :] - initial[..., 0, :])), 1e-3)
-    inner = jnp.ones((segments + 1, 1)).at[jnp.array([0, -1])].set(0)
+    inner = jnp.ones((segments + 1, 1), jnp.float32).at[jnp.array([0, -1])].set(0)
 
     def gradient(path: jax.Array) -> jax.Array:
         samples_world = jax.lax.stop_gradient(_along(path))
-        distance, normal = sdf_and_grad(field, samples_world, unknown)
+        distance, normal = distance_and_grad(field, samples_world, unknown, bound)
 
         def cost(path: jax.Array) -> jax.Array:
             # The map to first order: exact for the gradient, with one query.
@@ -148,14 +155,17 @@ def optimize_trajectory(
         update, memory = adam.update(gradient(path), memory)
         return (jnp.asarray(optax.apply_updates(path, update)), memory), None
 
-    (path, _), _ = jax.lax.scan(step, (initial, adam.init(initial)), length=steps)
-    clearance = least(sdf_and_grad(field, _along(path), unknown)[0]) - radius_m
+    start = varying_like((initial, adam.init(initial)), field, initial)
+    (path, _), _ = jax.lax.scan(step, start, length=steps)
+    clearance = least(distance_and_grad(field, _along(path), unknown, bound)[0]) - radius_m
     return Trajectory(path, clearance, jnp.sum(length(split(jnp.diff(path, axis=-2))), axis=-1))
 
 
 def _along(path: jax.Array) -> jax.Array:
     """Samples each segment evenly, (..., N, 3) -> (..., 1 + (N - 1) k, 3)."""
-    share = (jnp.arange(_SAMPLES_PER_SEGMENT) + 1)[:, None] / _SAMPLES_PER_SEGMENT
+    share = (jnp.arange(_SAMPLES_PER_SEGMENT, dtype=jnp.float32) + 1)[
+        :, None
+    ] / _SAMPLES_PER_SEGMENT
     begin, end = path[..., :-1, None, :], path[..., 1:, None, :]
     inner = begin + share * (end - begin)
     return jnp.concatenate([path[..., :1, :], inner.reshape(*path.shape[:-2], -1, 3)], axis=-2)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import length, split
 from hiosdf_jax._src.samples.draw import Samples, draw_from_mask
 
@@ -73,5 +74,6 @@ def nearest_distance(queries: jax.Array, points: jax.Array, valid: jax.Array) ->
         return jnp.minimum(least, jnp.min(square, axis=1)), None
 
     start = jnp.full(queries.shape[0], jnp.inf, jnp.result_type(queries, points))
+    start = varying_like(start, queries, points)
     square, _ = jax.lax.scan(compare, start, points.reshape(-1, size, 3))
     return jnp.where(square < 1e29, jnp.sqrt(square), jnp.inf)

@@ -9,6 +9,7 @@ from hiosdf_jax._src.change.vanishing import is_recent
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.evidence import is_observed
+from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.samples.draw import Samples, draw_from_mask
 from hiosdf_jax._src.state import NO_FEATURE, Grid, surface_of
@@ -78,4 +79,4 @@ def _move_to_changes(
         moved = jnp.where(usable[:, None], around, kept)
         return jnp.concatenate([points_world[: points_world.shape[0] - count], moved])
 
-    return jax.lax.cond(jnp.any(recent), move, lambda points: points, points_world)
+    return cond(jnp.any(recent), move, lambda points: points, points_world)

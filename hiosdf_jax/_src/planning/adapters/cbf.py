@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, sdf
+from hiosdf_jax._src.field.points import AnyField, Unknown
 from hiosdf_jax._src.numerics.intake import as_number, as_real
-from hiosdf_jax._src.planning.clearance import checked_spheres
-from hiosdf_jax._src.state import Baked
+from hiosdf_jax._src.planning.clearance import checked_spheres, sphere_clearance
+from hiosdf_jax._src.state import Baked, Bound
 
 BodySpheres = Callable[[jax.Array], tuple[jax.Array, Any]]
 """Configuration (n,) -> the body's spheres: centers_world (S, 3) m and radii (S,) m."""
@@ -29,6 +29,7 @@ def velocity_filter(
     margin_m: float,
     gain_per_s: float = 5.0,
     unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> Callable[[AnyField, jax.Array, jax.Array], jax.Array]:
     """Makes a filter that changes velocity commands as little as keeps the body off the map.
 
@@ -56,6 +57,8 @@ def velocity_filter(
             Keep it well below 1 / dt for commands held for dt.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         The pure function (field, q (n,), desired velocity (n,)) -> velocity (n,). The map is a
@@ -69,7 +72,7 @@ def velocity_filter(
         raise ValueError(f"velocity_limits is {velocity_limits!r}, expected shape (n,), all > 0")
     margin_m = as_number("margin_m", margin_m, 0)
     gain_per_s = as_number("gain_per_s", gain_per_s, 0, above=True)
-    cbf = cbfpy.CBF.from_config(_Shares(spheres, limits, margin_m, gain_per_s, unknown))
+    cbf = cbfpy.CBF.from_config(_Shares(spheres, limits, margin_m, gain_per_s, unknown, bound))
 
     def filtered(field: AnyField, q: jax.Array, desired: jax.Array) -> jax.Array:
         shares = cbf.safety_filter(q, desired / limits, field)
@@ -119,6 +122,7 @@ class _Shares(cbfpy.CBFConfig):
         margin_m: float,
         gain_per_s: float,
         unknown: Unknown,
+        bound: Bound,
     ) -> None:
         self._limits, self._gain_per_s = limits, gain_per_s
         count = len(limits)
@@ -127,7 +131,7 @@ class _Shares(cbfpy.CBFConfig):
         @jax.jit
         def barriers(z: jax.Array, field: AnyField) -> jax.Array:
             centers_world, radii = spheres(z)
-            return sdf(field, centers_world, unknown) - jnp.asarray(radii, jnp.float32) - margin_m
+            return sphere_clearance(field, centers_world, radii, unknown, bound) - margin_m
 
         self._barriers = barriers
         super().__init__(

@@ -11,6 +11,7 @@ from hiosdf_jax._src.field.points import AnyField, Unknown
 from hiosdf_jax._src.numerics.gradient import least, value_and_gradient
 from hiosdf_jax._src.numerics.intake import as_array
 from hiosdf_jax._src.planning.clearance import sphere_clearance
+from hiosdf_jax._src.state import Bound
 
 if TYPE_CHECKING:
     from frax import Manipulator
@@ -58,6 +59,7 @@ def arm_clearance(
     q: Any,
     pose_world_base: Any = None,
     unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> jax.Array:
     """Computes the clearance of the nearest of an arm's moving links.
 
@@ -73,6 +75,8 @@ def arm_clearance(
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         (...) float32, m: the least sdf(center) - radius, negative in collision. Differentiable.
@@ -81,7 +85,7 @@ def arm_clearance(
         ValueError: As for `arm_spheres`.
     """
     centers_world, radii = arm_spheres(arm, q, pose_world_base)
-    return least(sphere_clearance(field, centers_world, radii, unknown))
+    return least(sphere_clearance(field, centers_world, radii, unknown, bound))
 
 
 def arm_clearance_and_grad(
@@ -90,6 +94,7 @@ def arm_clearance_and_grad(
     q: Any,
     pose_world_base: Any = None,
     unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> tuple[jax.Array, jax.Array]:
     """Computes `arm_clearance` and its gradient, by one reverse-mode evaluation for the batch.
 
@@ -100,6 +105,8 @@ def arm_clearance_and_grad(
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         The clearance (...) float32, m, and d(clearance)/dq (..., n) float32, m/rad or m/m.
@@ -108,4 +115,6 @@ def arm_clearance_and_grad(
         ValueError: As for `arm_spheres`.
     """
     q = jnp.asarray(as_array("q", q))
-    return value_and_gradient(lambda q: arm_clearance(field, arm, q, pose_world_base, unknown), q)
+    return value_and_gradient(
+        lambda q: arm_clearance(field, arm, q, pose_world_base, unknown, bound), q
+    )

@@ -103,7 +103,11 @@ def cover_box(half: np.ndarray, tolerance: float) -> SphereCover:
 
 
 def cover_solid(
-    distance: SignedDistance, low: np.ndarray, high: np.ndarray, tolerance: float
+    distance: SignedDistance,
+    low: np.ndarray,
+    high: np.ndarray,
+    tolerance: float,
+    check_time: Callable[[], None] = lambda: None,
 ) -> SphereCover:
     """Covers a solid given by its signed distance.
 
@@ -112,6 +116,7 @@ def cover_solid(
         low: (3,) m, low corner of a box that contains the solid.
         high: (3,) m, high corner.
         tolerance: m, > 0.
+        check_time: Called now and then; may raise to stop.
 
     Returns:
         The spheres.
@@ -121,6 +126,7 @@ def cover_solid(
 
     random = np.random.default_rng(0)
     cells, reach = _partition(distance, low, high, _CELL * tolerance)
+    check_time()
     tree = KDTree(cells)
     centers, size = _partition(distance, low, high, _CENTER * tolerance)
     # With the cells' corners, so that planes of symmetry carry centers.
@@ -131,6 +137,7 @@ def cover_solid(
     balls: list[_Ball] = []
     uncovered = np.ones(len(cells), bool)
     while uncovered.any():
+        check_time()
         some = _draw(random, np.nonzero(uncovered)[0], _MOST_CELLS)
         rows = _draw(random, np.arange(len(centers)), _MOST_CENTERS)
         # The ball around a cell's own center always contains the cell.

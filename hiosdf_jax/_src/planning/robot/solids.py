@@ -127,7 +127,10 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> SignedDis
     counts = np.ceil((fine.max(axis=0) - corner) / pitch).astype(int) + 4
     index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
     nodes = corner + pitch * index.reshape(-1, 3)
-    gap = np.asarray(tree.query(nodes, distance_upper_bound=2 * pitch)[0]).reshape(counts) - error
+    gap = (
+        np.asarray(tree.query(nodes, distance_upper_bound=2 * pitch, workers=-1)[0]).reshape(counts)
+        - error
+    )
     labeled: Any = ndimage.label(gap > pitch / 2)
     regions = np.asarray(labeled[0])
     enclosed = (regions != regions[0, 0, 0]) & (regions > 0)
@@ -135,7 +138,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> SignedDis
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # Approximate: exact searches from deep inside are slow.
-        far = np.asarray(tree.query(points, eps=_SEARCH)[0])
+        far = np.asarray(tree.query(points, eps=_SEARCH, workers=-1)[0])
         near = np.maximum(far / (1 + _SEARCH) - error, 0)
         node = np.rint((points - corner) / pitch).astype(int)
         within = np.all((node >= 0) & (node < counts), axis=1)

@@ -5,7 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -15,12 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.exporting import exportable
 from hiosdf_jax._src.numerics.gradient import least
-from hiosdf_jax._src.numerics.intake import as_array, as_number
-from hiosdf_jax._src.planning.clearance import sphere_clearance
+from hiosdf_jax._src.numerics.intake import as_number
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.planning.clearance import sphere_clearance, sphere_clearance_and_grad
 from hiosdf_jax._src.planning.robot import cover, solids
+from hiosdf_jax._src.state import Bound
 
 
+@exportable()
 class RobotSpheres(flax.struct.PyTreeNode):
     """Spheres on the bodies of a robot; made by `spheres_from_model`.
 
@@ -35,6 +44,7 @@ class RobotSpheres(flax.struct.PyTreeNode):
     radii: jax.Array
 
 
+@exportable()
 class BodyPoses(NamedTuple):
     """Poses of bodies; `mjx.Data` and `mujoco.MjData` have the same two attributes.
 
@@ -52,35 +62,57 @@ def spheres_from_model(
     tolerance_m: float,
     bodies: Iterable[int | str] | None = None,
     geoms: Iterable[int | str] | None = None,
+    *,
+    budget_s: float = math.inf,
 ) -> RobotSpheres:
     """Covers geoms of a robot by spheres that protrude by at most a tolerance.
 
     The cover is complete. A mesh is covered as it is, with all that it encloses, not as the convex
     hull that MuJoCo collides. Half the tolerance takes about four times as many spheres. Not inside
-    jit.
+    jit. Meshes take seconds to minutes: a bar in the terminal shows the progress.
 
     Example:
         model = mujoco.MjModel.from_xml_path("examples/rover.xml")
         spheres = planning.spheres_from_model(model, tolerance_m=0.02)
 
     Args:
-        model: `mujoco.MjModel` or `mjx.Model`.
+        model: `mujoco.MjModel`, `mjx.Model`, `mujoco.MjSpec`, or the path of an XML file.
         tolerance_m: Most that a sphere may protrude beyond its geom, m, > 0.
         bodies: Names or ids of the bodies whose colliding geoms (contype or conaffinity not 0)
-            are covered; by default all bodies but the world.
+            are covered; by default those that can move, or all but the world if none can.
         geoms: Names or ids of the geoms to cover, instead of `bodies`.
+        budget_s: Longest time that it may take, s. It is exceeded by up to the time of one search.
 
     Returns:
         The spheres, in the order of the geoms.
 
+    Warns:
+        UserWarning: A chosen body has geoms, but none that collides: nothing covers it.
+
     Raises:
         ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen, or
             a chosen geom is a plane, a height field or an SDF.
+        TimeoutError: The time is up.
     """
+    # Imported here: a robot that loads its spheres from a file needs no progress bar.
+    from tqdm import tqdm
+
     tolerance_m = as_number("tolerance_m", tolerance_m, 0, above=True)
-    parts = []
-    for geom in _chosen_geoms(model, bodies, geoms):
-        centers, radii = _cover_geom(model, geom, tolerance_m)
+    model = _compiled_model(model)
+    chosen = _chosen_geoms(model, bodies, geoms)
+    start, parts = time.monotonic(), []
+
+    def check_time() -> None:
+        if time.monotonic() - start > budget_s:
+            raise TimeoutError(
+                f"covered {len(parts)} of {len(chosen)} geoms in budget_s = {budget_s} s, expected "
+                f"all: allow more time, a tolerance above {tolerance_m} m, or simpler geoms"
+            )
+
+    # Without a terminal, or within two seconds, nothing is shown.
+    for geom in tqdm(chosen, desc="covering geoms by spheres", delay=2, disable=None):
+        check_time()
+        centers, radii = _cover_geom(model, geom, tolerance_m, check_time)
         rotation = _rotation(np.asarray(model.geom_quat[geom], float))
         centers_body = np.asarray(model.geom_pos[geom], float) + centers @ rotation.T
         body = np.full(len(radii), model.geom_bodyid[geom])
@@ -93,6 +125,7 @@ def spheres_from_model(
     )
 
 
+@plain
 def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
     """Places a robot's spheres in a configuration.
 
@@ -102,17 +135,17 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
             `mujoco.MjData`, or `BodyPoses`.
 
     Returns:
-        Centers, (..., S, 3) float32, m, world. Differentiable.
+        Centers, (..., S, 3) float32, m, world. Differentiable. Inside jit they are NaN, i.e. in
+        collision, on bodies without a pose.
 
     Raises:
-        ValueError: An argument is of a wrong kind, a shape of the poses is wrong, or there are
-            fewer bodies than the spheres need.
+        ValueError: An argument is of a wrong kind, a shape of the poses is wrong, there are fewer
+            bodies than the spheres need, or (outside jit) kinematics has not run.
     """
     _check_spheres(spheres)
     if not (hasattr(data, "xpos") and hasattr(data, "xmat")):
         raise ValueError(f"data is {type(data).__name__}, expected bodies' poses xpos and xmat")
-    xpos = jnp.asarray(as_array("data.xpos", data.xpos))
-    xmat = jnp.asarray(as_array("data.xmat", data.xmat))
+    xpos, xmat = on_device("data.xpos", data.xpos), on_device("data.xmat", data.xmat)
     if xpos.ndim < 2 or xpos.shape[-1] != 3:
         raise ValueError(f"data.xpos has shape {xpos.shape}, expected (..., B, 3)")
     if xmat.shape not in ((*xpos.shape, 3), (*xpos.shape[:-1], 9)):
@@ -128,13 +161,25 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
                 f"index in spheres.body"
             )
     rotations = xmat.reshape(*xpos.shape, 3)[..., spheres.body, :, :]
+    # Before kinematics MuJoCo's rotations are zero.
+    posed = jnp.any(rotations != 0, axis=(-2, -1))[..., None]
+    if not isinstance(posed, jax.core.Tracer) and not np.all(jax.device_get(posed)):
+        raise ValueError(
+            "data.xmat has rotations that are zero, expected poses of all bodies: run "
+            "mujoco.mj_kinematics(model, data) or mjx.kinematics(model, data) first"
+        )
     # Sums of products: a matrix product may run in reduced precision on a GPU.
     offsets_world = jnp.sum(rotations * spheres.centers_body[:, None, :], axis=-1)
-    return xpos[..., spheres.body, :] + offsets_world
+    return jnp.where(posed, xpos[..., spheres.body, :] + offsets_world, jnp.nan)
 
 
+@plain
 def robot_clearance(
-    field: AnyField, spheres: RobotSpheres, data: Any, unknown: Unknown = "obstacle"
+    field: AnyField,
+    spheres: RobotSpheres,
+    data: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
 ) -> jax.Array:
     """Computes the least clearance of a robot's spheres in a configuration.
 
@@ -151,6 +196,8 @@ def robot_clearance(
         data: As for `place_spheres`.
         unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
             uses the map's prediction.
+        bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
+            of the distance; see `hiosdf_jax.query`.
 
     Returns:
         (...) float32, m; negative in collision. Differentiable, through `mjx.kinematics` also by
@@ -160,7 +207,72 @@ def robot_clearance(
         ValueError: As for `place_spheres` and `sphere_clearance`.
     """
     centers_world = place_spheres(spheres, data)
-    return least(sphere_clearance(field, centers_world, spheres.radii, unknown))
+    return least(sphere_clearance(field, centers_world, spheres.radii, unknown, bound))
+
+
+@plain
+def robot_clearance_and_grad(
+    field: AnyField,
+    spheres: RobotSpheres,
+    data: Any,
+    unknown: Unknown = "obstacle",
+    bound: Bound = "sdf",
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Computes the clearance of a robot and its gradient by the motion of each body.
+
+    With the Jacobians of a body, for instance from `mujoco.mj_jacBody`, the gradient by the joints
+    is the sum over bodies b of jacp_b^T by_position[b] + jacr_b^T by_rotation[b].
+
+    Example:
+        model = mujoco.MjModel.from_xml_path("examples/rover.xml")
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        spheres = planning.spheres_from_model(model, tolerance_m=0.02)
+        clearance, by_position, by_rotation = planning.robot_clearance_and_grad(
+            field, spheres, data
+        )
+
+    Args:
+        field: A map, a snapshot of one, or a baked snapshot.
+        spheres: The robot's spheres.
+        data: As for `place_spheres`.
+        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+            uses the map's prediction.
+        bound: As for `robot_clearance`.
+
+    Returns:
+        The clearance (...) float32, m, and its gradients by the bodies' positions, (..., B, 3), and
+        by rotations around the origins of their frames, (..., B, 3) m/rad, world frame.
+
+    Raises:
+        ValueError: As for `robot_clearance`.
+    """
+    xpos = on_device("data.xpos", data.xpos)
+    centers_world = place_spheres(spheres, data)
+    value, slope = sphere_clearance_and_grad(field, centers_world, spheres.radii, unknown, bound)
+    nearest = jnp.arange(value.shape[-1]) == jnp.argmin(value, axis=-1)[..., None]
+    force = jnp.where(nearest[..., None], slope, 0)
+    torque = jnp.cross(centers_world - xpos[..., spheres.body, :], force)
+
+    def per_body(vectors: jax.Array) -> jax.Array:
+        return jnp.zeros_like(xpos).at[..., spheres.body, :].add(vectors)
+
+    return least(value), per_body(force), per_body(jnp.where(nearest[..., None], torque, 0))
+
+
+def _compiled_model(model: Any) -> Any:
+    """Reads the model of a file, or compiles that of a specification."""
+    if isinstance(model, str | os.PathLike):
+        import mujoco
+
+        return mujoco.MjModel.from_xml_path(os.fspath(model))
+    if hasattr(model, "compile") and not hasattr(model, "nbody"):
+        return model.compile()
+    if not hasattr(model, "geom_bodyid"):
+        raise ValueError(
+            f"model is {type(model).__name__}, expected a MjModel, mjx.Model, MjSpec or a path"
+        )
+    return model
 
 
 def _check_spheres(spheres: Any) -> None:
@@ -177,16 +289,35 @@ def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
         chosen = _ids(model, geoms, "geom", model.ngeom)
     else:
         carriers = (
-            range(1, model.nbody) if bodies is None else _ids(model, bodies, "body", model.nbody)
+            _moving_bodies(model) if bodies is None else _ids(model, bodies, "body", model.nbody)
         )
         colliding = (np.asarray(model.geom_contype) != 0) | (
             np.asarray(model.geom_conaffinity) != 0
         )
         carried = np.isin(np.asarray(model.geom_bodyid), list(carriers))
         chosen = np.nonzero(colliding & carried)[0].tolist()
+        _warn_of_bare_bodies(model, carried, chosen)
     if not chosen:
         raise ValueError("no geom is chosen, expected geoms, or bodies with colliding geoms")
     return sorted(set(chosen))
+
+
+def _moving_bodies(model: Any) -> list[int]:
+    """Lists the bodies that can move, or all but the world where none can."""
+    moving = np.nonzero(np.asarray(model.body_weldid) != 0)[0].tolist()
+    return moving or list(range(1, model.nbody))
+
+
+def _warn_of_bare_bodies(model: Any, carried: np.ndarray, chosen: list[int]) -> None:
+    bodies = np.asarray(model.geom_bodyid)
+    bare = sorted(set(bodies[carried].tolist()) - set(bodies[chosen].tolist()))
+    if bare and chosen:
+        names = [_name(model, "body", body) for body in bare]
+        warnings.warn(
+            f"bodies {names} have geoms but none that collides, so that no sphere covers them: "
+            f"choose geoms by geoms= if they should be covered",
+            stacklevel=4,
+        )
 
 
 def _ids(model: Any, wanted: Any, kind: str, count: int) -> list[int]:
@@ -211,7 +342,9 @@ def _name(model: Any, kind: str, index: int) -> str:
     return model.names[start : model.names.index(b"\0", start)].decode()
 
 
-def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.SphereCover:
+def _cover_geom(
+    model: Any, geom: int, tolerance: float, check_time: Callable[[], None]
+) -> cover.SphereCover:
     # Imported here: nothing else in this module needs it.
     import mujoco
 
@@ -225,13 +358,16 @@ def _cover_geom(model: Any, geom: int, tolerance: float) -> cover.SphereCover:
         return cover.cover_box(size, tolerance)
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         half = size[[0, 0, 1]]
-        return cover.cover_solid(solids.cylinder(size[0], size[1]), -half, half, tolerance)
+        return cover.cover_solid(
+            solids.cylinder(size[0], size[1]), -half, half, tolerance, check_time
+        )
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        return cover.cover_solid(solids.ellipsoid(size), -size, size, tolerance)
+        return cover.cover_solid(solids.ellipsoid(size), -size, size, tolerance, check_time)
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         vertices, faces = _mesh(model, int(model.geom_dataid[geom]))
         solid = solids.mesh(vertices, faces, tolerance)
-        return cover.cover_solid(solid, vertices.min(axis=0), vertices.max(axis=0), tolerance)
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        return cover.cover_solid(solid, low, high, tolerance, check_time)
     raise ValueError(
         f"geom {geom} ({_name(model, 'geom', geom)!r}) is of type "
         f"{kind.name.removeprefix('mjGEOM_').lower()}, expected sphere, capsule, box, cylinder, "

@@ -1,0 +1,32 @@
+"""Arguments as arrays on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from hiosdf_jax._src.numerics.intake import as_array
+
+
+def on_device(name: str, values: Any) -> jax.Array:
+    """Converts an argument to float32, by a transfer that `jax.transfer_guard` counts as explicit.
+
+    Args:
+        name: What messages call the argument.
+        values: As for `as_array`.
+
+    Returns:
+        The array.
+
+    Raises:
+        ValueError: The values are no real numbers.
+    """
+    array = as_array(name, values)
+    return array if isinstance(array, jax.Array) else jax.device_put(array)
+
+
+def scalar(value: Any, dtype: Any = np.float32) -> jax.Array:
+    """Makes a number an array () on the device, by an explicit transfer."""
+    return jax.device_put(np.asarray(value, dtype))
