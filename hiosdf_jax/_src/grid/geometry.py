@@ -91,8 +91,9 @@ def unflatten(shape: tuple[int, ...], flat: jax.Array) -> Vector:
 
     `jnp.unravel_index` also takes negative indices, which costs five operations more per axis.
     """
-    rows, z = jax.lax.div(flat, shape[2]), jax.lax.rem(flat, shape[2])
-    return jax.lax.div(rows, shape[1]), jax.lax.rem(rows, shape[1]), z
+    _, across, deep = map(np.int32, shape)  # int32 also where 64-bit numbers are enabled
+    rows, z = jax.lax.div(flat, deep), jax.lax.rem(flat, deep)
+    return jax.lax.div(rows, across), jax.lax.rem(rows, across), z
 
 
 class Corners(NamedTuple):

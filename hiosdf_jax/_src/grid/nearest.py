@@ -72,7 +72,7 @@ def nearest_sites(
         before = squared.shape
         squared, shift = _transform_axis(squared, along, axis + 1, horizon, start[axis], size[axis])
         chosen = _chosen(before, shift, axis + 1, start[axis])
-        own = jax.lax.rem(chosen, math.prod(before[1:]))
+        own = chosen % math.prod(before[1:])
         nearest = own if nearest is None else _gather(nearest, chosen)
     assert nearest is not None, "no axis in order"
     found = squared <= horizon**2
