@@ -10,6 +10,7 @@ from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, snapshot, update
+from hiosdf_jax._src.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "Flag",
     "MapState",
     "Query",
+    "Registration",
     "Report",
     "bake",
     "extract_mesh",
@@ -30,6 +32,7 @@ __all__ = [
     "moving_rows",
     "planning",
     "query",
+    "refine_pose",
     "save",
     "sdf",
     "sdf_and_grad",
