@@ -291,7 +291,7 @@ UNIT = np.eye(6)
         ({"prior": (BAD, UNIT)}, "prior: pose "),
         ({"prior": (np.eye(4), -UNIT)}, "prior covariance is not positive definite"),
         ({"prior": (np.eye(4), UNIT + np.eye(6, k=1))}, "prior covariance is not symmetric"),
-        ({"prior": (np.eye(4), np.inf * UNIT)}, "prior covariance has values"),
+        ({"prior": (np.eye(4), np.full((6, 6), np.inf))}, "prior covariance has values"),
         ({"noise": (0.0, 1.0)}, "noise a"),
     ],
 )

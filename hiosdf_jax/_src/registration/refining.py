@@ -43,7 +43,7 @@ _CANDIDATES = 16384
 # A cloud is registered if at least this share of its returns lies where the map has observed, and
 # this share of those on its surfaces.
 _LEAST_COMPARABLE = 0.1
-_LEAST_INLIERS = 0.5
+_LEAST_INLIERS = 0.7
 
 
 class Registration(NamedTuple):
