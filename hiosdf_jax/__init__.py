@@ -16,6 +16,7 @@ from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
+from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ __all__ = [
     "Flag",
     "MapState",
     "Query",
+    "Registration",
     "Report",
     "bake",
     "extract_mesh",
@@ -45,6 +47,7 @@ __all__ = [
     "pad_cloud",
     "planning",
     "query",
+    "refine_pose",
     "save",
     "sdf",
     "sdf_and_grad",

@@ -1,0 +1,1 @@
+"""Poses that the map itself corrects."""

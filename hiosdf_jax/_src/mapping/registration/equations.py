@@ -1,0 +1,316 @@
+"""The weighted least-squares problem of a pose, linearized: residuals, information, steps.
+
+Rotations are measured in meters, as the way of a return at the cloud's typical range. So all six
+components of a motion have one unit, and directions can be compared.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax._src.mapping.registration.matching import match_points
+from hiosdf_jax._src.mapping.registration.motion import motion_between, move
+from hiosdf_jax._src.state import Baked, Field
+
+INLIER_DEVIATIONS = 3.0
+"""The weight of a return falls to a quarter at this many standard deviations."""
+
+# No patch is known better than this, m.
+_LEAST_SIGMA_M = 0.005
+
+# Returns this deep in unseen space are compared, m, and this many coarse scales.
+_DEEPEST_M = 0.1
+_DEEPEST_SCALES = 2.0
+
+# A direction is free if the returns fit about as well where they are moved this far along it, m: if
+# their mean loss, which is at most 1, grows by less than this. Its slope alone does not tell: noise
+# turns the normals of patches. At exact poses it grows along a corridor by at most 0.002, and in a
+# furnished house by at least 0.012. Coarse steps that drift along a corridor raise it to 0.01.
+_TRIED_M = 0.2
+_LEAST_GROWTH = 0.01
+
+# As many of the least determined directions are tried: a plane leaves three free.
+_TRIED_DIRECTIONS = 3
+
+# Information of a free direction without a prior: a standard deviation of 100 m.
+_FREE_INFORMATION = 1e-4
+
+# Typical ranges are limited to this, m, so that rotations keep a sensible weight.
+_RANGES_M = (0.5, 20.0)
+
+# Cells of space, over which normals are averaged, m, and sums to which cells are spread.
+_CELL_M = 0.3
+_CELLS = 4096
+
+
+class Rows(NamedTuple):
+    """The returns that are used.
+
+    Attributes:
+        points: (N, 3) m, sensor frame.
+        sigma: Standard deviation of the range, (N,) m.
+        some: The row is a return, (N,) bool.
+        length: Typical range, () m: a rotation by 1 rad counts as this many meters.
+    """
+
+    points: jax.Array
+    sigma: jax.Array
+    some: jax.Array
+    length: jax.Array
+
+
+class Residuals(NamedTuple):
+    """The returns at a pose, compared with the map.
+
+    Attributes:
+        distance: Signed distances, (N,) m.
+        jacobian: Their derivative by the motion, (N, 6).
+        sigma: Standard deviation of each, (N,) m.
+        comparable: The map has observed the place, (N,) bool.
+        weight: Inverse variance, less for outliers, 0 where nothing can be compared, (N,).
+        points_world: (N, 3) m.
+    """
+
+    distance: jax.Array
+    jacobian: jax.Array
+    sigma: jax.Array
+    comparable: jax.Array
+    weight: jax.Array
+    points_world: jax.Array
+
+
+class Anchor(NamedTuple):
+    """What holds the directions that the returns do not determine.
+
+    Attributes:
+        pose: (4, 4), the mean of the prior, or the initial pose.
+        information: Inverse covariance of the prior, (6, 6), in meters; None without a prior.
+    """
+
+    pose: jax.Array
+    information: jax.Array | None
+
+
+class Directions(NamedTuple):
+    """Principal directions of an information matrix.
+
+    Attributes:
+        basis: Unit vectors as columns, (6, 6).
+        free: The returns do not determine the direction, (6,) bool.
+    """
+
+    basis: jax.Array
+    free: jax.Array
+
+
+def make_rows(points: jax.Array, some: jax.Array, noise: tuple[jax.Array, jax.Array]) -> Rows:
+    """Prepares returns.
+
+    Args:
+        points: (N, 3) m, sensor frame, finite.
+        some: The row is a return, (N,) bool.
+        noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m.
+
+    Returns:
+        The rows.
+    """
+    square = jnp.sum(points**2, axis=-1)
+    mean = jnp.sum(jnp.where(some, square, 0)) / jnp.maximum(jnp.sum(some), 1)
+    length = jnp.clip(jnp.sqrt(jnp.maximum(jax.lax.stop_gradient(mean), 1e-6)), *_RANGES_M)
+    return Rows(points, noise[0] + noise[1] * square, some, length)
+
+
+def take_rows(rows: Rows, index: jax.Array | slice) -> Rows:
+    """Selects some of the rows; their typical range stays."""
+    return Rows(rows.points[index], rows.sigma[index], rows.some[index], rows.length)
+
+
+def units(rows: Rows) -> jax.Array:
+    """Returns the meters per unit of each component of a motion, (6,)."""
+    return jnp.concatenate([jnp.ones(3), jnp.full(3, rows.length)])
+
+
+def compare(
+    field: Field | Baked, rows: Rows, pose: jax.Array, scale_m: jax.Array | float
+) -> Residuals:
+    """Compares returns with a map.
+
+    Args:
+        field: The map.
+        rows: The returns.
+        pose: (4, 4) T_world_sensor.
+        scale_m: How far surfaces may be from where they should be; 0 for the last, fine steps.
+
+    Returns:
+        The residuals.
+    """
+    offset = jnp.sum(rows.points[:, None, :] * pose[:3, :3], axis=-1)
+    points_world = offset + pose[:3, 3]
+    match = match_points(field, points_world)
+    # Only the part of the range's error along the normal counts.
+    square = jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-6)
+    across = jnp.sum(match.normal * offset, axis=-1) ** 2 / square
+    variance = across * rows.sigma**2 + match.spread**2 + _LEAST_SIGMA_M**2
+    comparable = rows.some & match.usable
+    comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * scale_m)
+    sigma = jnp.sqrt(variance + (scale_m / INLIER_DEVIATIONS) ** 2)
+    # The function of Geman and McClure.
+    ratio = match.distance / (INLIER_DEVIATIONS * sigma)
+    weight = jnp.where(comparable, 1 / (sigma * (1 + ratio**2)) ** 2, 0)
+    turn = jnp.cross(offset, match.normal) / rows.length
+    jacobian = jnp.concatenate([match.normal, turn], axis=-1)
+    return Residuals(match.distance, jacobian, sigma, comparable, weight, points_world)
+
+
+def information_of(residuals: Residuals) -> jax.Array:
+    """Computes the information matrix of independent returns, (6, 6) 1/m^2."""
+    weighted = residuals.weight[:, None] * residuals.jacobian
+    return jnp.matmul(weighted.T, residuals.jacobian, precision="highest")
+
+
+def slope_of(residuals: Residuals) -> jax.Array:
+    """Computes the slope of half the weighted sum of squares by the motion, (6,) 1/m."""
+    weighted = residuals.weight * residuals.distance
+    return jnp.sum(weighted[:, None] * residuals.jacobian, axis=0)
+
+
+def sum_in_cells(values: jax.Array, points_world: jax.Array, cell_m: float) -> jax.Array:
+    """Sums values (N, K) over the points (N, 3), m, of each cell of space; (CELLS, K)."""
+    cell = jnp.floor(points_world / cell_m).astype(jnp.int32).astype(jnp.uint32)
+    # Large odd numbers spread the cells over the sums. Few share one by chance.
+    row = cell[:, 0] * 73856093 ^ cell[:, 1] * 19349663 ^ cell[:, 2] * 83492791
+    return jax.ops.segment_sum(values, (row % _CELLS).astype(jnp.int32), _CELLS)
+
+
+def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Directions:
+    """Finds the principal directions of the returns' information, and which are free.
+
+    Args:
+        field: The map.
+        rows: The returns.
+        pose: (4, 4), near the solution.
+
+    Returns:
+        The directions, the least determined first.
+    """
+    here = compare(field, rows, pose, 0.0)
+    # Means over cells of space: they average the noise of normals.
+    counts = (here.weight * here.sigma**2)[:, None]
+    values = jnp.concatenate([counts, counts * here.jacobian], axis=-1)
+    total = sum_in_cells(values, here.points_world, _CELL_M)
+    count = total[:, :1]
+    mean = total[:, 1:] / jnp.maximum(count, 1e-9)
+    _, basis = jnp.linalg.eigh(jnp.matmul(mean.T, count * mean, precision="highest"))
+
+    def growth(motion: jax.Array) -> jax.Array:
+        there = compare(field, rows, move(pose, motion), 0.0)
+        more = jnp.where(here.comparable, _loss(there) - _loss(here), 0)
+        return jnp.sum(more) / jnp.maximum(jnp.sum(here.comparable), 1)
+
+    way = _TRIED_M * basis.T[:_TRIED_DIRECTIONS] / units(rows)
+    grown = jax.lax.map(growth, jnp.concatenate([way, -way])).reshape(2, -1)
+    free = ~(jnp.min(grown, axis=0) >= _LEAST_GROWTH)
+    free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
+    return Directions(basis, free | ~jnp.any(here.comparable))
+
+
+def _loss(residuals: Residuals) -> jax.Array:
+    """The loss of Geman and McClure, (N,), from 0 to 1."""
+    square = (residuals.distance / (INLIER_DEVIATIONS * residuals.sigma)) ** 2
+    return square / (1 + square)
+
+
+def no_free_directions() -> Directions:
+    """Returns the axes, none of them free."""
+    return Directions(jnp.eye(6), jnp.zeros(6, bool))
+
+
+def turn(matrix: jax.Array, directions: Directions) -> jax.Array:
+    """Turns a matrix (6, 6) to the directions' basis, without what it has of free ones."""
+    inside = jnp.matmul(
+        directions.basis.T,
+        jnp.matmul(matrix, directions.basis, precision="highest"),
+        precision="highest",
+    )
+    bound = ~directions.free
+    return jnp.where(bound[:, None] & bound, inside, 0)
+
+
+def balance(
+    directions: Directions, slope: jax.Array, anchor: Anchor, rows: Rows, pose: jax.Array
+) -> jax.Array:
+    """Computes what is zero at the solution: the slopes of returns and anchor.
+
+    Returns tell nothing of free directions. There the prior decides, or the initial pose.
+
+    Args:
+        directions: The principal directions of the returns' information.
+        slope: Of the returns, (6,).
+        anchor: What holds free directions.
+        rows: The returns.
+        pose: (4, 4).
+
+    Returns:
+        (6,), one component per direction.
+    """
+    away = units(rows) * motion_between(anchor.pose, pose)
+    own = jnp.where(directions.free, 0, jnp.matmul(directions.basis.T, slope, precision="highest"))
+    return own + jnp.matmul(_pull(directions, anchor), away, precision="highest")
+
+
+def stiffness(information: jax.Array, directions: Directions, anchor: Anchor) -> jax.Array:
+    """Computes the information of returns and anchor, (6, 6), in the directions' basis."""
+    pull = jnp.matmul(_pull(directions, anchor), directions.basis, precision="highest")
+    return turn(information, directions) + pull
+
+
+def find_step(
+    residuals: Residuals,
+    directions: Directions,
+    anchor: Anchor,
+    rows: Rows,
+    pose: jax.Array,
+    inflation: jax.Array | float = 1.0,
+    damping: float = 0.0,
+) -> jax.Array:
+    """Computes the Gauss-Newton step.
+
+    Args:
+        residuals: The returns at the pose.
+        directions: As for `balance`.
+        anchor: As for `balance`.
+        rows: As for `balance`.
+        pose: As for `balance`.
+        inflation: How many returns tell as much as one independent one would.
+        damping: Added to the diagonal of the information, as a share of its mean.
+
+    Returns:
+        The motion, (6,) m and rad.
+    """
+    information = information_of(residuals) / inflation
+    information += damping * jnp.trace(information) / 6 * jnp.eye(6)
+    matrix = stiffness(information, directions, anchor)
+    wanted = balance(directions, slope_of(residuals) / inflation, anchor, rows, pose)
+    size = _sizes(matrix)
+    step = size * jnp.linalg.solve(size[:, None] * matrix * size, size * wanted)
+    return -jnp.matmul(directions.basis, step, precision="highest") / units(rows)
+
+
+def invert(matrix: jax.Array) -> jax.Array:
+    """Inverts a positive definite matrix whose rows differ by many orders of magnitude."""
+    size = _sizes(matrix)
+    return size[:, None] * jnp.linalg.inv(size[:, None] * matrix * size) * size
+
+
+def _sizes(matrix: jax.Array) -> jax.Array:
+    return jax.lax.rsqrt(jnp.maximum(jnp.diag(matrix), 1e-12))
+
+
+def _pull(directions: Directions, anchor: Anchor) -> jax.Array:
+    """The anchor's information, from motions to the directions' basis, (6, 6)."""
+    if anchor.information is None:
+        return jnp.where(directions.free, _FREE_INFORMATION, 0)[:, None] * directions.basis.T
+    return jnp.matmul(directions.basis.T, anchor.information, precision="highest")

@@ -1,0 +1,82 @@
+"""What the map says of the returns of a cloud: distance, normal, spread, observed or not."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.grid import geometry, lookup
+from hiosdf_jax._src.state import Baked, Field
+
+# A gradient that is shorter than this lies between surfaces and has no direction.
+_LEAST_SLOPE = 0.5
+
+# The error of trilinear interpolation near surfaces, as a share of the samples' spacing.
+_BAKED_SPREAD = 0.05
+
+
+class Match(NamedTuple):
+    """Points compared with a map.
+
+    Attributes:
+        distance: Signed distance from the surface, (N,) m.
+        normal: Its gradient, (N, 3).
+        spread: Standard deviation of the surface there, (N,) m.
+        depth: How far the point lies in unseen space, (N,) m; negative in observed space.
+        usable: The map has a surface near the point, (N,) bool.
+    """
+
+    distance: jax.Array
+    normal: jax.Array
+    spread: jax.Array
+    depth: jax.Array
+    usable: jax.Array
+
+
+def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
+    """Compares points with a map.
+
+    A live map answers by its grid alone: the network changes no surface and costs more.
+
+    Args:
+        field: The map.
+        points_world: (N, 3) m, finite.
+
+    Returns:
+        The comparison. Differentiable by the points.
+    """
+    if isinstance(field, Baked):
+        answer = query(field, points_world)
+        distance, normal, depth = answer.sdf, answer.grad, -answer.frontier
+        spread = jnp.full(distance.shape, _BAKED_SPREAD) * field.resolution
+        # `bake` takes half a cell's diagonal off the frontier.
+        depth = depth - 3**0.5 / 2 * field.resolution
+        inside = jnp.ones(distance.shape, bool)
+    else:
+        config, surface = field.config, field.surface
+
+        def nearest(points: jax.Array) -> tuple[jax.Array, jax.Array]:
+            found = lookup.nearest_patch(config, surface, points)
+            return found.sdf, found.spread
+
+        distance, pull, spread = jax.vjp(nearest, points_world, has_aux=True)
+        (normal,) = pull(jnp.ones_like(distance))
+        depth = -lookup.frontier_distance(config, surface, geometry.clamp(config, points_world))
+        inside = jnp.all(points_world == geometry.clamp(config, points_world), axis=-1)
+        inside &= jnp.abs(distance) < 0.99 * config.distance_horizon
+    steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
+    return Match(distance, normal, spread, depth, inside & steep)
+
+
+def noise_of(field: Field | Baked) -> tuple[float, float]:
+    """Returns (a, b) of the standard deviation a + b r^2 of a return, m and 1/m.
+
+    It is that of the map's configuration. A baked field has none, and gets the default.
+    """
+    if isinstance(field, Field):
+        return field.config.range_noise
+    return Config.range_noise

@@ -1,0 +1,65 @@
+"""Small motions of a pose: three components of translation, m, and three of rotation, rad.
+
+Both are along the axes of the world frame, and the rotation is about the sensor.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+# Below this angle, rad, series replace quotients of small numbers.
+_SMALL = 1e-3
+
+
+def move(pose: jax.Array, motion: jax.Array) -> jax.Array:
+    """Moves a pose.
+
+    Args:
+        pose: (4, 4) T_world_sensor.
+        motion: (6,) m and rad.
+
+    Returns:
+        (4, 4).
+    """
+    rotation = jnp.matmul(rotation_of(motion[3:]), pose[:3, :3], precision="highest")
+    return jnp.asarray(pose).at[:3, :3].set(rotation).at[:3, 3].add(motion[:3])
+
+
+def motion_between(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Computes the motion that leads from one pose to another.
+
+    Args:
+        first: (4, 4) T_world_sensor.
+        second: (4, 4), turned by less than pi from the first.
+
+    Returns:
+        (6,) m and rad: `move(first, motion)` is `second`.
+    """
+    turn = jnp.matmul(second[:3, :3], first[:3, :3].T, precision="highest")
+    vector = vector_of(turn)
+    return jnp.concatenate([second[:3, 3] - first[:3, 3], vector])
+
+
+def rotation_of(vector: jax.Array) -> jax.Array:
+    """Computes the rotation about a vector (3,) by its length, rad; (3, 3)."""
+    square = jnp.sum(vector**2)
+    small = square < _SMALL**2
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
+    second = jnp.where(small, 0.5 - square / 24, (1 - jnp.cos(angle)) / angle**2)
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    across = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    return jnp.eye(3) + first * across + second * jnp.matmul(across, across, precision="highest")
+
+
+def vector_of(rotation: jax.Array) -> jax.Array:
+    """Computes the rotation vector, (3,) rad, of a rotation (3, 3) by less than pi."""
+    across = rotation - rotation.T
+    twice = jnp.stack([across[2, 1], across[0, 2], across[1, 0]])
+    square = jnp.sum(twice**2) / 4  # of the sine
+    small = square < _SMALL**2
+    sine = jnp.sqrt(jnp.where(small, 1, square))
+    angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)
+    return twice / 2 * jnp.where(small, 1 + square / 6, angle / sine)

@@ -1,0 +1,209 @@
+"""Refines the pose of a cloud by a map."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.field.points import AnyField, as_field
+from hiosdf_jax._src.mapping.registration.equations import (
+    INLIER_DEVIATIONS,
+    Anchor,
+    compare,
+    make_rows,
+    take_rows,
+    units,
+)
+from hiosdf_jax._src.mapping.registration.matching import noise_of
+from hiosdf_jax._src.mapping.registration.selection import draw_evenly
+from hiosdf_jax._src.mapping.registration.solving import (
+    differentiable,
+    select_rows,
+    solve_coarse,
+    solve_fine,
+    take_evenly,
+)
+from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, inflation_of
+from hiosdf_jax._src.numerics.posed_cloud import (
+    as_floats,
+    check_extras,
+    check_pose,
+    check_shapes,
+    finite_rows,
+)
+from hiosdf_jax._src.state import Baked, Field
+
+# Rows of a cloud from which the others are selected.
+_CANDIDATES = 16384
+
+# A cloud is registered if at least this share of its returns lies where the map has observed, and
+# this share of those on its surfaces.
+_LEAST_COMPARABLE = 0.1
+_LEAST_INLIERS = 0.7
+
+
+class Registration(NamedTuple):
+    """A pose that was refined by a map.
+
+    Attributes:
+        pose: (4, 4) float32, T_world_sensor.
+        covariance: Of its error, (6, 6) float32: the translation, m, and then the rotation about
+            the sensor, rad, both along the axes of the world frame. Directions that the cloud does
+            not determine have a standard deviation of 100 m, or that of the prior.
+        residual: Root mean square distance of the inliers from the surface, () float32, m.
+        inliers: Share of the returns in observed space that lie on a surface, () float32.
+        converged: The steps came to rest, and enough returns fit, () bool. Where it is False, the
+            other values must not be used.
+    """
+
+    pose: jax.Array
+    covariance: jax.Array
+    residual: jax.Array
+    inliers: jax.Array
+    converged: jax.Array
+
+
+def refine_pose(
+    field: AnyField,
+    cloud: Any,
+    pose: Any,
+    prior: tuple[Any, Any] | None = None,
+    *,
+    noise: tuple[Any, Any] | None = None,
+) -> Registration:
+    """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
+
+    Gauss-Newton steps on the distances, with weights that outliers lose. The pose may be 15 cm
+    and 6 degrees off. Pure: works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field,
+    the cloud and the prior; see docs/poses.md.
+
+    Args:
+        field: A map, a snapshot of one, or a baked field.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        pose: (4, 4) T_world_sensor, where to begin.
+        prior: (mean, covariance): a pose (4, 4) and the covariance of its error (6, 6), as in
+            `Registration`, such as that of odometry. Without one, directions that the cloud does
+            not determine stay as in `pose`.
+        noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m. By
+            default it is `Config.range_noise` of the map; of a baked field, the default's.
+
+    Returns:
+        The refined pose, and how far it can be trusted.
+
+    Raises:
+        ValueError: A type or shape is wrong. Outside jit also: the pose or the prior's mean is not
+            finite or not rigid, the prior's covariance is not symmetric and positive definite, the
+            cloud has no finite row, or a value of `noise` is out of range.
+
+    Example:
+        >>> found = hio.refine_pose(field, cloud, odometry_pose)
+        >>> if found.converged:
+        ...     state = hio.update(state, cloud, found.pose)
+    """
+    field = as_field(field)
+    check_shapes(cloud, pose)
+    prior = _checked_prior(prior)
+    _, checked_noise = check_extras(None, noise)
+    leaves = (*jax.tree.leaves((field, prior, checked_noise)), cloud, pose)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return _refine(field, jnp.asarray(cloud), jnp.asarray(pose), prior, checked_noise)
+    floats = as_floats("cloud", cloud)
+    finite_rows(floats)
+    # Padded to a multiple of one size, so that clouds of a stream share their compilation.
+    rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
+    padded = np.full((rows, 3), np.nan, np.float32)
+    padded[: len(floats)] = floats
+    return _refine_jit(field, padded, check_pose(pose), prior, checked_noise)
+
+
+def _refine(
+    field: Field | Baked,
+    cloud: jax.Array,
+    pose: jax.Array,
+    prior: tuple[jax.Array, jax.Array] | None,
+    noise: jax.Array | None,
+) -> Registration:
+    cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
+    if cloud.shape[0] == 0:
+        cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
+    points, some = draw_evenly(cloud, _CANDIDATES)
+    floor, growth = noise_of(field) if noise is None else noise
+    rows = make_rows(points, some, (jnp.float32(floor), jnp.float32(growth)))
+    anchor = Anchor(pose, None)
+    if prior is not None:
+        mean, covariance = (jnp.asarray(part, jnp.float32) for part in prior)
+        per_unit = units(rows)
+        anchor = Anchor(mean, jnp.linalg.inv(per_unit[:, None] * covariance * per_unit))
+
+    still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
+    near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held)
+    index, directions = select_rows(still, frozen, near)
+    chosen = take_rows(frozen, index)
+    found, finished = solve_fine(still, chosen, near, directions, held, 1.0)
+    inflation = jnp.float32(1)
+    if prior is not None:
+        # The prior counts by its covariance, so returns must not count as independent of each
+        # other.
+        inflation = inflation_of(compare(still, chosen, found, 0.0), directions)
+        found, finished = solve_fine(still, chosen, found, directions, held, inflation)
+    covariance = covariance_of(compare(still, chosen, found, 0.0), directions, held, rows)
+
+    even = take_evenly(frozen)
+    seen = compare(still, even, found, 0.0)
+    fits = seen.comparable & (jnp.abs(seen.distance) < INLIER_DEVIATIONS * seen.sigma)
+    count, comparable, total = (jnp.sum(part) for part in (fits, seen.comparable, even.some))
+    square = jnp.sum(jnp.where(fits, seen.distance**2, 0)) / jnp.maximum(count, 1)
+    inliers = count / jnp.maximum(comparable, 1)
+    enough = comparable >= jnp.maximum(_LEAST_COMPARABLE * total, 1)
+    finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
+    exact = differentiable(field, take_rows(rows, index), found, directions, anchor, inflation)
+    return Registration(
+        pose=jnp.where(finite, exact, pose),
+        covariance=covariance,
+        residual=jnp.sqrt(square),
+        inliers=inliers,
+        converged=finished & enough & (inliers >= _LEAST_INLIERS) & finite,
+    )
+
+
+_refine_jit = jax.jit(_refine)
+
+
+def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
+    """Checks a prior, of tracers only the shapes."""
+    if prior is None:
+        return None
+    try:
+        mean, covariance = prior
+    except (TypeError, ValueError):
+        raise ValueError(f"prior is {prior!r}, expected (mean, covariance)") from None
+    shapes = np.shape(mean), np.shape(covariance)
+    if shapes != ((4, 4), (6, 6)):
+        raise ValueError(
+            f"prior has a mean of shape {shapes[0]} and a covariance of shape {shapes[1]}, "
+            "expected (4, 4) and (6, 6)"
+        )
+    if not isinstance(mean, jax.core.Tracer):
+        mean = check_pose(mean, "prior")
+    if not isinstance(covariance, jax.core.Tracer):
+        covariance = as_floats("prior covariance", covariance)
+        _check_covariance(covariance)
+    return jnp.asarray(mean, jnp.float32), jnp.asarray(covariance, jnp.float32)
+
+
+def _check_covariance(covariance: np.ndarray) -> None:
+    exact = covariance.astype(np.float64)
+    expected = "expected a symmetric, positive definite matrix, m and rad"
+    if not np.isfinite(exact).all():
+        raise ValueError(f"prior covariance has values that are not finite, {expected}")
+    # In units of each component's own deviation: those of meters and radians differ.
+    size = np.sqrt(np.maximum(np.diag(exact), 1e-30))
+    scaled = exact / np.outer(size, size)
+    if not np.allclose(scaled, scaled.T, atol=1e-3):
+        raise ValueError(f"prior covariance is not symmetric, {expected}")
+    if np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] < 1e-5:
+        raise ValueError(f"prior covariance is not positive definite, {expected}")

@@ -1,0 +1,65 @@
+"""Which returns of a cloud are used: few, but enough for each direction of the pose."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+# Share of the rows that are drawn evenly. The others are drawn by what they tell of the pose.
+_EVEN_SHARE = 0.2
+
+
+def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
+    """Selects finite rows of a cloud at even steps.
+
+    Args:
+        cloud: (N, 3) m; a row with a NaN or inf is no return.
+        count: Most rows to select.
+
+    Returns:
+        The rows (min(N, count), 3) m, 0 where there is none, and a mask (min(N, count),) of those
+        that are returns. Rows that are no returns do not change which others are selected.
+    """
+    finite = jnp.all(jnp.isfinite(cloud), axis=-1)
+    count = min(count, cloud.shape[0])
+    rank = jnp.cumsum(finite)
+    total = rank[-1]
+    steps = jnp.arange(count, dtype=jnp.float32)
+    # With fewer returns than rows, each is selected once.
+    wanted = jnp.where(total > count, jnp.floor(steps * (total / count)), steps)
+    row = jnp.searchsorted(rank, wanted.astype(rank.dtype) + 1)
+    some = steps < total
+    row = jnp.where(some, jnp.minimum(row, cloud.shape[0] - 1), 0)
+    return jnp.where(some[:, None], cloud[row], 0), some
+
+
+def draw_informative(
+    jacobian: jax.Array, weight: jax.Array, information: jax.Array, count: int
+) -> jax.Array:
+    """Selects the rows that determine a pose best, so that few determine its weakest direction.
+
+    A row's leverage is its share of the information in each direction, summed over the directions.
+    Far walls, edges and what stands across a corridor have much of it. (The idea of geometrically
+    stable sampling by Gelfand et al., 3DIM 2003.)
+
+    Args:
+        jacobian: Derivative of each row's distance by the pose, (N, 6).
+        weight: (N,), 0 for rows that are not to be used.
+        information: An invertible (6, 6) at least the weighted sum of the outer products.
+        count: Rows to select.
+
+    Returns:
+        (count,) int32, ascending; rows of much leverage come more than once.
+    """
+    solved = jnp.linalg.solve(information, jacobian.T).T
+    leverage = weight * jnp.sum(jacobian * solved, axis=-1)
+    possible = (weight > 0).astype(jnp.float32)
+
+    def share(values: jax.Array) -> jax.Array:
+        return values / jnp.maximum(jnp.sum(values), 1e-30)
+
+    chance = _EVEN_SHARE * share(possible) + (1 - _EVEN_SHARE) * share(leverage)
+    below = jnp.cumsum(chance)
+    steps = (jnp.arange(count, dtype=jnp.float32) + 0.5) / count * below[-1]
+    row = jnp.searchsorted(below, steps)
+    return jnp.minimum(row, chance.shape[0] - 1).astype(jnp.int32)

@@ -1,0 +1,178 @@
+"""Finds the pose at which a cloud fits a map: coarse steps with many outliers, then fine ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from hiosdf_jax._src.mapping.registration.equations import (
+    Anchor,
+    Directions,
+    Rows,
+    balance,
+    compare,
+    find_directions,
+    find_step,
+    information_of,
+    no_free_directions,
+    slope_of,
+    take_rows,
+)
+from hiosdf_jax._src.mapping.registration.motion import move
+from hiosdf_jax._src.mapping.registration.selection import draw_informative
+from hiosdf_jax._src.state import Baked, Field
+
+# Surfaces may be this far from where they should be in the first and in the last coarse step, m.
+# Smaller first scales lose poses that are 15 cm and 6 degrees off; fewer steps do not suffice
+# along directions in which few returns tell anything.
+_COARSE_M = (0.7, 0.03)
+_COARSE_STEPS = 24
+_COARSE_ROWS = 1024
+_DAMPING = 1e-5
+
+_FINE_STEPS = 24
+_WHOLE_STEPS = 8  # half steps then: the distance has kinks, around which whole ones may jump
+_FINE_ROWS = 2048
+_FINISHED_M = 5e-6
+_RESTING_M = 2e-3
+
+
+def take_evenly(rows: Rows) -> Rows:
+    """Selects rows at even steps, as many as coarse steps use."""
+    every = max(rows.points.shape[0] // _COARSE_ROWS, 1)
+    return take_rows(rows, slice(None, None, every))
+
+
+def solve_coarse(field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anchor) -> jax.Array:
+    """Brings a pose near the solution, with a tolerance that shrinks from step to step.
+
+    Args:
+        field: The map.
+        rows: The returns.
+        pose: (4, 4), where to begin.
+        anchor: What holds free directions.
+
+    Returns:
+        (4, 4).
+    """
+    few = take_evenly(rows)
+    first, last = _COARSE_M
+    # Fine steps bring free directions back.
+    axes = no_free_directions()
+
+    def step(i: jax.Array, pose: jax.Array) -> jax.Array:
+        scale_m = first * (last / first) ** (i / (_COARSE_STEPS - 1))
+        residuals = compare(field, few, pose, scale_m)
+        return move(pose, find_step(residuals, axes, anchor, few, pose, damping=_DAMPING))
+
+    return jax.lax.fori_loop(0, _COARSE_STEPS, step, pose)
+
+
+def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.Array, Directions]:
+    """Selects the returns that determine the pose best, for the fine steps.
+
+    Args:
+        field: The map.
+        rows: The returns.
+        pose: (4, 4), near the solution.
+
+    Returns:
+        Indices of rows, at most as many as fine steps use, all of them if there are no more; and
+        the principal directions of the returns.
+    """
+    directions = find_directions(field, take_evenly(rows), pose)
+    if rows.points.shape[0] <= _FINE_ROWS:
+        return jnp.arange(rows.points.shape[0]), directions
+    residuals = compare(field, rows, pose, 0.0)
+    information = information_of(residuals)
+    # Free directions must not draw all rows.
+    held = jnp.where(directions.free, jnp.trace(information), 0)
+    information += (directions.basis * held) @ directions.basis.T
+    information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6)
+    row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
+    return row, directions
+
+
+def solve_fine(
+    field: Field | Baked,
+    rows: Rows,
+    pose: jax.Array,
+    directions: Directions,
+    anchor: Anchor,
+    inflation: jax.Array | float,
+) -> tuple[jax.Array, jax.Array]:
+    """Steps until the pose stays where it is.
+
+    Args:
+        field: The map.
+        rows: The returns.
+        pose: (4, 4), near the solution.
+        directions: Principal directions, some of them free.
+        anchor: What holds free directions.
+        inflation: How many returns tell as much as one independent one would.
+
+    Returns:
+        The pose (4, 4), and whether the last step was short, () bool.
+    """
+
+    def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
+        pose, _, count = carry
+        residuals = compare(field, rows, pose, 0.0)
+        motion = find_step(residuals, directions, anchor, rows, pose, inflation)
+        way = jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
+        motion = jnp.where(count < _WHOLE_STEPS, 1, 0.5) * motion
+        return move(pose, motion), way, count + 1
+
+    def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, way, count = carry
+        return (count < _FINE_STEPS) & ~(way <= _FINISHED_M)
+
+    start = (pose, jnp.float32(jnp.inf), jnp.int32(0))
+    pose, way, _ = jax.lax.while_loop(goes_on, step, start)
+    return pose, way <= _RESTING_M
+
+
+def differentiable(
+    field: Field | Baked,
+    rows: Rows,
+    pose: jax.Array,
+    directions: Directions,
+    anchor: Anchor,
+    inflation: jax.Array | float,
+) -> jax.Array:
+    """Gives a solution its derivatives by the map, the returns and the anchor.
+
+    At the solution a balance is zero, and stays so when they change (implicit differentiation). The
+    steps that led there are not differentiated. Which rows are used and which directions are free
+    is held fixed.
+
+    Args:
+        field: The map.
+        rows: The returns.
+        pose: (4, 4), the solution.
+        directions: Principal directions, some of them free.
+        anchor: What holds free directions.
+        inflation: As for `solve_fine`.
+
+    Returns:
+        The pose.
+    """
+
+    def unbalance(motion: jax.Array) -> jax.Array:
+        moved = move(pose, motion)
+        slope = slope_of(compare(field, rows, moved, 0.0)) / inflation
+        return balance(directions, slope, anchor, rows, moved)
+
+    def solve_linear(linear: Callable, value: jax.Array) -> jax.Array:
+        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(6))
+        # Rows of free directions are many orders smaller than others.
+        size = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-12)
+        return jnp.linalg.solve(size[:, None] * matrix, size * value)
+
+    def stay(_: Callable, start: jax.Array) -> jax.Array:
+        return start
+
+    motion = jax.lax.custom_root(unbalance, jnp.zeros(6), stay, solve_linear)
+    return move(pose, motion)

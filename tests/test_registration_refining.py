@@ -1,0 +1,302 @@
+"""Poses refined by a map: exact fields, noise, corridors, derivatives, wrong input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import HALF, room_cloud
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import hiosdf_jax as hio
+
+RESOLUTION = 0.05
+NOISE = (0.01, 0.0)
+COUNT = 700
+
+
+def baked_field(distance, half):
+    """Bakes an exact distance function of points (..., 3) in a box."""
+    half = np.asarray(half)
+    shape = tuple(np.ceil(2 * half / RESOLUTION).astype(int) + 1)
+    points = -half + RESOLUTION * np.stack(np.indices(shape), axis=-1)
+    values = jnp.asarray(distance(points), jnp.float32)
+    return hio.Baked(
+        corner_world=jnp.asarray(-half, jnp.float32),
+        resolution=jnp.float32(RESOLUTION),
+        sdf=values,
+        frontier=jnp.full(shape, 1.0, jnp.float32),
+        lower=values,
+        updates=jnp.int32(10),
+        stamp=jnp.float32(0),
+    )
+
+
+@pytest.fixture(scope="module")
+def room():
+    return baked_field(lambda points: (HALF - np.abs(points)).min(axis=-1), HALF + 0.6)
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    """Two parallel walls, without floor, ceiling or end."""
+    return baked_field(lambda points: 1 - np.abs(points[..., 1]), (3, 1.5, 1.5))
+
+
+def moved(pose, translation, turn):
+    result = np.array(pose, float)
+    result[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ result[:3, :3]
+    result[:3, 3] += translation
+    return result.astype(np.float32)
+
+
+def perturbed(pose, rng, way_m, angle_deg):
+    way, turn = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+    return moved(pose, way_m * way, np.radians(angle_deg) * turn)
+
+
+def error(pose, exact):
+    """The motion from the exact pose to another, (6,) m and rad."""
+    pose, exact = np.asarray(pose, float), np.asarray(exact, float)
+    turn = Rotation.from_matrix(pose[:3, :3] @ exact[:3, :3].T).as_rotvec()
+    return np.concatenate([pose[:3, 3] - exact[:3, 3], turn])
+
+
+def noisy(cloud, rng, sigma=NOISE[0]):
+    ranges = np.linalg.norm(cloud, axis=1, keepdims=True)
+    return (cloud * (1 + sigma * rng.normal(size=ranges.shape) / ranges)).astype(np.float32)
+
+
+@jax.jit
+def refine(field, cloud, pose):
+    return hio.refine_pose(field, cloud, pose, noise=NOISE)
+
+
+@jax.jit
+def refine_with_prior(field, cloud, pose, mean, covariance):
+    return hio.refine_pose(field, cloud, pose, (mean, covariance), noise=NOISE)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_pose_15_cm_and_6_degrees_off_is_found(room, seed):
+    cloud, pose = room_cloud(seed, COUNT, 0.3 * seed, (0.1, -0.05, 0.08))
+    found = refine(room, cloud, perturbed(pose, np.random.default_rng(seed), 0.15, 6))
+    away = error(found.pose, pose)
+    assert np.linalg.norm(away[:3]) < 1e-3
+    assert np.linalg.norm(away[3:]) < 1e-3
+    assert bool(found.converged)
+    assert float(found.inliers) > 0.99
+    assert float(found.residual) < 2e-3
+
+
+def test_noise_and_outliers_against_scipy(room):
+    """The same loss, minimized in float64 on the exact planes."""
+    rng = np.random.default_rng(0)
+    cloud, pose = room_cloud(3, COUNT, 0.4, (0.2, 0.1, 0.0))
+    cloud = noisy(cloud, rng)
+    cloud[::10] *= rng.uniform(0.5, 0.9, (len(cloud[::10]), 1)).astype(np.float32)
+
+    def residuals(motion):
+        turn = Rotation.from_rotvec(motion[3:]).as_matrix() @ pose[:3, :3]
+        offset = cloud @ turn.T
+        to_walls = HALF - np.abs(offset + pose[:3, 3] + motion[:3])
+        wall = to_walls.argmin(axis=1)
+        along = np.take_along_axis(offset, wall[:, None], axis=1)[:, 0] ** 2
+        variance = NOISE[0] ** 2 * along / (offset**2).sum(axis=1)
+        ratio = to_walls.min(axis=1) / np.sqrt(variance + 0.005**2 + 0.0025**2) / 3
+        return ratio / np.sqrt(1 + ratio**2)
+
+    expected = least_squares(residuals, np.zeros(6), xtol=1e-12, ftol=1e-12).x
+    found = refine(room, cloud, perturbed(pose, rng, 0.05, 3))
+    away = error(found.pose, pose)
+    np.testing.assert_allclose(away, expected, atol=5e-4)
+    assert np.linalg.norm(expected[:3]) < 5e-3
+    assert 0.85 < float(found.inliers) < 0.95
+
+
+def test_the_covariance_is_that_of_the_errors(room):
+    rng = np.random.default_rng(1)
+    clouds, poses = zip(
+        *(room_cloud(i, COUNT, 0.1 * i, rng.uniform(-0.2, 0.2, 3)) for i in range(200)), strict=True
+    )
+    starts = np.stack([perturbed(pose, rng, 0.05, 3) for pose in poses])
+    clouds = np.stack([noisy(cloud, rng) for cloud in clouds])
+    found = jax.jit(jax.vmap(refine, (None, 0, 0)))(room, clouds, starts)
+    away = np.stack([error(a, b) for a, b in zip(found.pose, poses, strict=True)])
+    square = np.einsum("ni,nij,nj->n", away, np.linalg.inv(np.asarray(found.covariance)), away)
+    high = chi2.ppf(0.975, 6)
+    # Never too sure. The floor of the noise, which the map's own errors need, is cautious here.
+    assert np.mean(square > high) < 0.05
+    assert 2 < square.mean() < 6.5
+
+
+def test_one_cloud_batches_and_jit_agree(room):
+    cloud, pose = room_cloud(5, COUNT)
+    starts = np.stack([perturbed(pose, np.random.default_rng(i), 0.05, 3) for i in range(3)])
+    one = [refine(room, cloud, start) for start in starts]
+    batch = jax.vmap(refine, (None, None, 0))(room, cloud, starts)
+    _, scanned = jax.lax.scan(lambda _, start: (None, refine(room, cloud, start)), None, starts)
+    eager = hio.refine_pose(room, cloud, starts[0], noise=NOISE)
+    for i, single in enumerate(one):
+        np.testing.assert_allclose(batch.pose[i], single.pose, atol=1e-4)
+        np.testing.assert_allclose(scanned.pose[i], single.pose, atol=1e-4)
+    np.testing.assert_allclose(eager.pose, one[0].pose, atol=1e-4)
+
+
+def test_rows_without_returns_change_nothing(room):
+    cloud, pose = room_cloud(6, COUNT)
+    start = perturbed(pose, np.random.default_rng(0), 0.05, 3)
+    more = np.full((COUNT + 300, 3), np.nan, np.float32)
+    more[150 : 150 + COUNT] = cloud
+    expected = hio.refine_pose(room, cloud, start, noise=NOISE)
+    found = hio.refine_pose(room, more, start, noise=NOISE)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def corridor_cloud(rng, count=COUNT):
+    along, height = rng.uniform(-1.2, 1.2, count), rng.uniform(-0.8, 0.8, count)
+    side = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
+    return noisy(np.stack([along, side, height], axis=1), rng)
+
+
+def test_a_corridor_leaves_its_length_as_it_was(corridor):
+    rng = np.random.default_rng(2)
+    cloud, translation = corridor_cloud(rng), np.array([0.07, 0.04, -0.03])
+    start = moved(np.eye(4), translation, [0.02, 0.0, -0.03])
+    found = refine(corridor, cloud, start)
+    way = np.asarray(found.pose)[:3, 3] - translation
+    assert np.abs(way[[0, 2]]).max() < 1e-3
+    assert abs(found.pose[1, 3]) < 3e-3
+    deviation = np.sqrt(np.diag(found.covariance))
+    assert (deviation[[0, 2]] > 50).all()
+    assert deviation[1] < 0.01
+    # Neither does it show the turn about the walls' normal.
+    turn = error(found.pose, np.eye(4))[3:]
+    assert np.abs(turn[[0, 2]]).max() < 3e-3
+    assert abs(turn[1]) < 2e-3
+
+
+def test_a_prior_holds_what_the_corridor_leaves_open(corridor):
+    rng = np.random.default_rng(3)
+    cloud, mean = corridor_cloud(rng), moved(np.eye(4), [0.1, 0.05, 0.02], [0.01, 0.02, 0.0])
+    prior = np.diag([0.1, 0.1, 0.1, 0.05, 0.05, 0.05]).astype(np.float32) ** 2
+    found = refine_with_prior(corridor, cloud, np.eye(4, dtype=np.float32), mean, prior)
+    assert np.abs(np.asarray(found.pose)[[0, 2], 3] - mean[[0, 2], 3]).max() < 2e-3
+    assert abs(found.pose[1, 3]) < 3e-3
+    deviation = np.sqrt(np.diag(found.covariance))
+    np.testing.assert_allclose(deviation[[0, 2, 4]], [0.1, 0.1, 0.05], rtol=0.05)
+    assert deviation[1] < 0.01
+
+
+def test_a_sure_prior_decides(room):
+    cloud, pose = room_cloud(8, COUNT)
+    mean = moved(pose, [0.02, 0.0, 0.0], [0.0, 0.0, 0.01])
+    sure = (1e-5**2 * np.eye(6)).astype(np.float32)
+    found = refine_with_prior(room, cloud, pose, mean, sure)
+    np.testing.assert_allclose(found.pose, mean, atol=1e-4)
+
+
+def test_derivatives_by_the_cloud_are_finite_differences(room):
+    rng = np.random.default_rng(4)
+    cloud, pose = room_cloud(9, COUNT, 0.2, (0.1, 0.0, 0.05))
+    # Away from the edges, where the distance has kinks.
+    world = cloud @ pose[:3, :3].T + pose[:3, 3]
+    near = np.sort(HALF - np.abs(world), axis=1)
+    cloud = np.where(near[:, 1:2] > 0.12, noisy(cloud, rng, 0.003), np.nan).astype(np.float32)
+    start = perturbed(pose, rng, 0.02, 1)
+    # Affine: of independent ways of 700 returns hardly anything would remain.
+    affine = (
+        rng.normal(size=(3, 3, 3)).astype(np.float32),
+        rng.normal(size=(3, 3)).astype(np.float32),
+    )
+    ways = [np.nan_to_num(cloud) @ a + b for a, b in zip(*affine, strict=True)]
+    weight = rng.normal(size=(4, 4)).astype(np.float32)
+
+    def score(cloud):
+        return jnp.sum(weight * refine(room, cloud, start).pose)
+
+    slope = np.nan_to_num(jax.grad(score)(cloud))
+    for way in ways:
+        step = 2e-3
+        change = (score(cloud + step * way) - score(cloud - step * way)) / (2 * step)
+        size = np.linalg.norm(weight) * np.abs(way).mean()
+        assert abs(np.sum(slope * way) - change) < 0.01 * max(abs(change), 0.1 * size)
+
+
+def test_derivatives_by_the_prior_are_finite_differences(corridor):
+    rng = np.random.default_rng(5)
+    cloud = corridor_cloud(rng)
+    prior = np.diag([0.1, 0.02, 0.1, 0.05, 0.05, 0.05]).astype(np.float32) ** 2
+
+    def place(shift):
+        mean = jnp.eye(4).at[:3, 3].set(shift)
+        return refine_with_prior(corridor, cloud, jnp.eye(4), mean, prior).pose[:3, 3]
+
+    shift = jnp.asarray([0.03, 0.01, -0.02])
+    slope = jax.jacrev(place)(shift)
+    step = 5e-3
+    change = [(place(shift + d) - place(shift - d)) / (2 * step) for d in step * np.eye(3)]
+    np.testing.assert_allclose(slope, np.stack(change, axis=1), atol=0.01)
+    np.testing.assert_allclose(np.diag(slope)[[0, 2]], 1, atol=0.01)
+
+
+def test_a_cloud_of_another_place_is_not_registered(room):
+    rng = np.random.default_rng(6)
+    cloud = rng.normal(size=(COUNT, 3)).astype(np.float32)
+    assert not bool(refine(room, cloud, np.eye(4, dtype=np.float32)).converged)
+    far = moved(np.eye(4), [50, 0, 0], np.zeros(3))
+    lost = refine(room, room_cloud(0, COUNT)[0], far)
+    assert not bool(lost.converged)
+    np.testing.assert_allclose(lost.pose, far)
+
+
+def test_inside_jit_an_empty_cloud_keeps_the_pose(room):
+    pose = moved(np.eye(4), [0.1, 0, 0], [0.1, 0, 0])
+    found = refine(room, np.full((COUNT, 3), np.nan, np.float32), pose)
+    assert not bool(found.converged)
+    np.testing.assert_allclose(found.pose, pose, atol=1e-6)
+
+
+def test_a_map_a_snapshot_and_a_baked_field_find_the_pose(sharp_map):
+    cloud, pose = room_cloud(50, 3000, 0.3, (0.1, 0.05, 0.0))
+    start = perturbed(pose, np.random.default_rng(7), 0.05, 3)
+    of_map = hio.refine_pose(sharp_map, cloud, start)
+    of_field = hio.refine_pose(hio.snapshot(sharp_map), cloud, start)
+    np.testing.assert_array_equal(of_map.pose, of_field.pose)
+    of_baked = hio.refine_pose(hio.bake(sharp_map), cloud, start)
+    for found in (of_map, of_baked):
+        away = error(found.pose, pose)
+        assert bool(found.converged)
+        assert np.linalg.norm(away[:3]) < 0.01
+        assert np.linalg.norm(away[3:]) < 0.01
+
+
+BAD = np.eye(4)
+BAD[0, 0] = 2
+UNIT = np.eye(6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"field": 3}, "field is int"),
+        ({"cloud": np.zeros((5, 2))}, r"cloud has shape \(5, 2\)"),
+        ({"cloud": np.full((5, 3), np.nan)}, "cloud has no finite row"),
+        ({"pose": np.eye(3)}, "pose has shape"),
+        ({"pose": BAD}, "^pose "),
+        ({"prior": np.eye(4)}, "prior is "),
+        ({"prior": (np.eye(4), np.eye(5))}, "prior has a mean of shape"),
+        ({"prior": (BAD, UNIT)}, "prior: pose "),
+        ({"prior": (np.eye(4), -UNIT)}, "prior covariance is not positive definite"),
+        ({"prior": (np.eye(4), UNIT + np.eye(6, k=1))}, "prior covariance is not symmetric"),
+        ({"prior": (np.eye(4), np.full((6, 6), np.inf))}, "prior covariance has values"),
+        ({"noise": (0.0, 1.0)}, "noise a"),
+    ],
+)
+def test_wrong_input_is_named(room, change, message):
+    cloud, pose = room_cloud(0, COUNT)
+    arguments = {"field": room, "cloud": cloud, "pose": pose} | change
+    with pytest.raises(ValueError, match=message):
+        hio.refine_pose(**arguments)

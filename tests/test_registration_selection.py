@@ -1,0 +1,57 @@
+"""Which returns are selected."""
+
+import numpy as np
+
+from hiosdf_jax._src.mapping.registration.selection import draw_evenly, draw_informative
+
+
+def test_rows_are_drawn_evenly_and_without_those_that_are_no_returns():
+    cloud = np.arange(300, dtype=np.float32).reshape(100, 3)
+    cloud[::2] = np.nan
+    points, some = draw_evenly(cloud, 10)
+    assert some.all()
+    np.testing.assert_array_equal(points, cloud[1::2][::5])
+
+
+def test_a_small_cloud_is_drawn_whole():
+    cloud = np.arange(30, dtype=np.float32).reshape(10, 3)
+    cloud[3] = np.inf
+    points, some = draw_evenly(cloud, 64)
+    assert points.shape == (10, 3)
+    np.testing.assert_array_equal(points[some], np.delete(cloud, 3, axis=0))
+    assert not points[~some].any()
+
+
+def test_rows_without_returns_change_nothing():
+    cloud = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    padded = np.full((900, 3), np.nan, np.float32)
+    padded[np.sort(np.random.default_rng(1).permutation(900)[:500])] = cloud
+    np.testing.assert_array_equal(draw_evenly(cloud, 100)[0], draw_evenly(padded, 100)[0])
+
+
+def test_an_empty_cloud_gives_no_rows():
+    points, some = draw_evenly(np.full((20, 3), np.nan, np.float32), 8)
+    assert not some.any()
+    assert np.isfinite(points).all()
+
+
+def test_the_rows_that_tell_of_a_rare_direction_are_drawn():
+    rng = np.random.default_rng(0)
+    jacobian = np.zeros((2000, 6), np.float32)
+    jacobian[:, 0] = 1
+    jacobian[:, 2:] = rng.normal(size=(2000, 4))
+    rare = rng.permutation(2000)[:20]
+    jacobian[rare, 1] = 1
+    weight = np.ones(2000, np.float32)
+    weight[::3] = 0
+    information = (jacobian * weight[:, None]).T @ jacobian
+    row = np.asarray(draw_informative(jacobian, weight, information, 200))
+    assert (weight[row] > 0).all()
+    assert (np.diff(row) >= 0).all()
+    # A sixth of the leverage lies in them, and a hundredth of the rows.
+    share = np.isin(row, rare).mean()
+    leverage = weight * np.einsum("ni,ij,nj->n", jacobian, np.linalg.inv(information), jacobian)
+    expected = 0.2 * (weight[rare] > 0).sum() / (weight > 0).sum()
+    expected += 0.8 * leverage[rare].sum() / leverage.sum()
+    assert abs(share - expected) < 0.02
+    assert share > 0.1
