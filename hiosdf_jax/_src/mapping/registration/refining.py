@@ -28,11 +28,12 @@ from hiosdf_jax._src.mapping.registration.solving import (
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, inflation_of
+from hiosdf_jax._src.numerics.intake import as_floats, is_traced
 from hiosdf_jax._src.numerics.posed_cloud import (
-    as_floats,
+    as_traced,
     check_extras,
     check_pose,
-    check_shapes,
+    checked_cloud,
     finite_rows,
 )
 from hiosdf_jax._src.state import Baked, Field
@@ -105,13 +106,11 @@ def refine_pose(
         ...     state = hio.update(state, cloud, found.pose)
     """
     field = as_field(field)
-    check_shapes(cloud, pose)
     prior = _checked_prior(prior)
     _, checked_noise = check_extras(None, noise)
-    leaves = (*jax.tree.leaves((field, prior, checked_noise)), cloud, pose)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-        return _refine(field, jnp.asarray(cloud), jnp.asarray(pose), prior, checked_noise)
-    floats = as_floats("cloud", cloud)
+    if is_traced(*jax.tree.leaves((field, prior, checked_noise)), cloud, pose):
+        return _refine(field, *as_traced(cloud, pose), prior, checked_noise)
+    floats = checked_cloud(cloud)
     finite_rows(floats)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
     rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
@@ -187,9 +186,9 @@ def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
             f"prior has a mean of shape {shapes[0]} and a covariance of shape {shapes[1]}, "
             "expected (4, 4) and (6, 6)"
         )
-    if not isinstance(mean, jax.core.Tracer):
+    if not is_traced(mean):
         mean = check_pose(mean, "prior")
-    if not isinstance(covariance, jax.core.Tracer):
+    if not is_traced(covariance):
         covariance = as_floats("prior covariance", covariance)
         _check_covariance(covariance)
     return jnp.asarray(mean, jnp.float32), jnp.asarray(covariance, jnp.float32)
