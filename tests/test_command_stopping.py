@@ -251,7 +251,7 @@ def test_a_map_of_something_else_is_refused(tmp_path, monkeypatch, quick, record
         ),
         (["map", with_truth], [], f"{saved} was mapped without exact distances"),
         (map_, ["--resume", str(tmp_path / "none.npz")], f"{tmp_path}/none.npz: No such file"),
-        (map_, ["--resume", stream], f"{stream} is not a hiosdf_jax map"),
+        (map_, ["--resume", stream], f"{stream}: not a readable hiosdf_jax map"),
         *(
             (map_, ["--resume", str(tmp_path / f"{name}.npz")], f"{tmp_path}/{name}.npz: {unknown}")
             for name in ("plain", "list", "less", "type", "negative")

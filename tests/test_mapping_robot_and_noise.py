@@ -149,7 +149,7 @@ def test_the_configurations_noise_is_the_default(empty_map):
         ({"noise": 0.01}, "noise is 0.01, expected two numbers"),
         ({"noise": (0.0, 0.1)}, "noise a has values"),
         ({"noise": (1e-22, 0.0)}, "noise a has values"),
-        ({"noise": (10**400, 0.0)}, "noise a has dtype object"),
+        ({"noise": (10**400, 0.0)}, "noise has dtype object"),
         ({"robot": ([["a", "b", "c"]], [1.0])}, "robot centers has dtype"),
         ({"noise": (0.01, -0.1)}, "noise b has values"),
     ],

@@ -8,6 +8,7 @@ from room import stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.stages import CHECKS, FUSION, STAGES, begin, is_accepted, refuse
+from hiosdf_jax._src.numerics.posed_cloud import check_extras
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def test_update_is_the_stages_one_by_one(program, empty_map, frame):
         return step.state
 
     def by_hand(state, cloud, pose, *noise):
-        noise = jnp.stack(noise)
+        _, noise = check_extras(None, noise)
         finite = jnp.all(jnp.isfinite(cloud), axis=-1)
         step = begin(state, cloud, finite, pose, noise=noise)
         for stage in CHECKS:

@@ -39,7 +39,7 @@ def unprivileged(tmp_path):
     if os.geteuid() != 0:
         yield
         return
-    for folder in tmp_path.parents[:2]:
+    for folder in tmp_path.parents[:3]:  # with a folder per worker
         folder.chmod(0o711)
     os.seteuid(65534)
     yield
