@@ -1,16 +1,15 @@
 """Shared compilations and maps: most of the time of these tests is spent in XLA's compiler."""
 
 import os
-import tempfile
 from pathlib import Path
 
 import jax
 import pytest
 
-# The same folder for both workers, and for the commands that tests start.
-_run = os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid()))
+# The same folder for both workers, for the commands that tests start, and for the next run.
+# `pytest --cache-clear` empties it.
 _cache = os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"hiosdf_jax_tests_{_run}")
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "d" / "jax")
 )
 jax.config.update("jax_compilation_cache_dir", _cache)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
