@@ -84,6 +84,10 @@ def case(tmp_path, kind):
         save = out / "metrics.json"
         arguments = [*map_, "--output", str(out), "--save", str(save)]
         return arguments, f"--save {save} would replace {save}"
+    if kind == "save onto a file that is no map":
+        save = tmp_path / "poses.txt"
+        save.write_text("0 0 0 0 0 0 0 1")
+        return [*map_, "--save", str(save)], f"--save {save} would replace a file that is no map"
     if kind == "save below a file":
         return [*map_, "--save", f"{stream}/map.npz"], f"{stream}/map.npz: Not a directory"
     if kind == "output is a file":
@@ -124,6 +128,7 @@ def case(tmp_path, kind):
         "save onto a device",
         "save onto the stream",
         "save onto a result",
+        "save onto a file that is no map",
         "save below a file",
         "output is a file",
         "output below a file",
@@ -189,10 +194,11 @@ def test_a_run_that_ends_before_all_truth_is_not_scored(tmp_path, capsys, quick)
     assert {path.name for path in output.iterdir()} == {*RESULTS, "checkpoint.npz"}
 
 
-def test_a_full_disk_keeps_the_older_run(tmp_path, capsys, quick, monkeypatch):
+def test_a_full_disk_keeps_the_older_run(tmp_path, capsys, quick, monkeypatch, empty_map):
     stream, saved = write_range(tmp_path / "stream.npz", 3), tmp_path / "map.npz"
     output = old_results(tmp_path / "out")
-    saved.write_bytes(b"old")
+    hio.save(saved, empty_map)
+    older = saved.read_bytes()
     arguments = ["map", str(stream), "--output", str(output), "--save", str(saved), *BOX]
     before = contents(tmp_path)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -213,7 +219,7 @@ def test_a_full_disk_keeps_the_older_run(tmp_path, capsys, quick, monkeypatch):
     monkeypatch.setattr(map_stream, "save_map", refuse)
     assert cli.main(arguments) == 2
     assert one_line_last(capsys) == "hiosdf: map.npz: No space left on device"
-    assert saved.read_bytes() == b"old"
+    assert saved.read_bytes() == older
     assert (output / "mesh.ply").read_bytes() == b"new"
 
 

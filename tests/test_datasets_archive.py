@@ -274,6 +274,8 @@ def test_values_that_no_map_has_are_refused(honest, tmp_path):
         ("grid.surface.side.npy", 4, "has grid.surface.side from .* to 4, expected"),
         ("optimism.npy", -1e9, "has optimism from -1000000000.0 to"),
         ("updates.npy", -1, "has updates from -1 to -1, expected 0"),
+        (weights, 3e38, "has network.params.* from .* to 3"),
+        ("network.origin_world.npy", 3e38, "has network.origin_world from .* to 3"),
     ):
         array = np.load(io.BytesIO(entries[name]))
         array[...] = np.where(np.arange(array.size).reshape(array.shape) == 0, value, array)

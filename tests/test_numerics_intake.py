@@ -346,7 +346,70 @@ def test_a_pose_of_any_type_is_the_same_pose(room_map):
 
 
 def test_a_config_that_could_never_map_is_refused():
+    for noise in ((1e-300, 0), (1e308, 1e308), (0.01, -1)):
+        with pytest.raises(ValueError, match="range_noise"):
+            hio.Config.light(BOUNDS, range_noise=noise)
     with pytest.raises(ValueError, match=r"bounds has x .*expected at most 100 km from the origin"):
         hio.Config.light(((1e9, 0, 0), (1e9 + 1, 1, 1)))
     with pytest.raises(ValueError, match="min_hits is 60, expected at most evidence_limit, 50"):
         hio.Config.light(BOUNDS, min_hits=60, evidence_limit=50)
+
+
+def nested(depth):
+    values = [0.0]
+    for _ in range(depth):
+        values = [values]
+    return values
+
+
+def endless():
+    values = [0.0]
+    values.append(values)
+    return values
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        nested(3000),
+        endless(),
+        [jnp.float32(0), 10**400, 0],
+        [jnp.float32(0), np.ma.masked, 0],
+        [jnp.float32(0), True, 0],
+        [jnp.zeros(3), Raises(KeyError("foreign"))],
+    ],
+    ids=["deep", "endless", "huge", "masked", "boolean", "foreign"],
+)
+def test_lists_that_are_no_arrays_are_refused_and_leave_nothing_behind(empty_map, points):
+    with pytest.raises(ValueError, match=r"points|lists are nested"):
+        hio.sdf(empty_map, points)
+    assert np.isfinite(hio.sdf(empty_map, [0.0, 0.0, 0.0]))
+
+
+def test_memory_that_is_gone_is_named(empty_map):
+    array = jnp.zeros(3)
+    array.delete()
+    with pytest.raises(ValueError, match="points was donated or deleted"):
+        hio.sdf(empty_map, array)
+    gone = jax.tree.map(jnp.copy, empty_map)
+    for leaf in jax.tree.leaves(gone):
+        leaf.delete()
+    for call in (lambda: hio.sdf(gone, [0.0, 0, 0]), lambda: hio.snapshot(gone)):
+        with pytest.raises(ValueError, match="was donated to an update"):
+            call()
+
+
+def test_a_window_far_away_is_refused(empty_map):
+    with pytest.raises(ValueError, match=r"center is .* expected finite coordinates of at most"):
+        hio.bake(empty_map, 0.3, [3.4e38, 0, 0], [1, 1, 1])
+    far = jax.jit(lambda center: hio.bake(empty_map, 0.3, center, [1, 1, 1]))([3.4e38, 0.0, 0.0])
+    assert hio.sdf(far, [0.0, 0, 0]) < 0
+
+
+@pytest.mark.parametrize("wrong", [-1.0, 0.0, np.nan, np.inf])
+def test_traced_margins_and_slopes_that_are_none_never_make_a_collision_free(empty_map, wrong):
+    cost = jax.jit(planning.collision_cost)
+    assert cost(-0.5, wrong) >= 0.5 and cost(0.05, wrong) > 0
+    start, end = jnp.zeros((1, 3)), jnp.full((1, 3), 0.1)
+    swept = jax.jit(lambda slope: planning.swept_clearance(empty_map, start, end, 0.1, slope=slope))
+    assert (swept(wrong) <= planning.swept_clearance(empty_map, start, end, 0.1)).all()

@@ -10,6 +10,8 @@ from typing import Any
 from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 
+_MOST_NOISE = 1e6  # larger, or smaller than 1e-6, a return's weight is no float32
+
 Point = tuple[float, float, float]
 Bounds = tuple[Point, Point]
 
@@ -155,6 +157,11 @@ class Config:
         if pair.shape != (2,):
             raise ValueError(f"Config.range_noise is {noise!r}, expected two numbers (a, b)")
         floor, growth = float(pair[0]), float(pair[1])
+        if not (1e-6 <= floor <= _MOST_NOISE and 0 <= growth <= _MOST_NOISE):
+            raise ValueError(
+                f"Config.range_noise is {noise!r}, expected a from 1e-6 to {_MOST_NOISE:g} m and "
+                f"b from 0 to {_MOST_NOISE:g} 1/m"
+            )
         object.__setattr__(self, "range_noise", (floor, growth))
         for field in dataclasses.fields(self):
             if "limits" not in field.metadata:

@@ -15,6 +15,7 @@ import optax
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.exporting import export_optimizer, exportable
+from hiosdf_jax._src.numerics.intake import is_traced
 
 NO_FEATURE = -128
 """`Derived.nearest` of a voxel without a surface patch within the distance horizon."""
@@ -371,13 +372,15 @@ def check_map(state: Any, stacked: bool = False) -> None:
     """Raises a ValueError if an argument named `state` is not a map, or not a single one."""
     if not isinstance(state, MapState):
         raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
+    _check_kept("state", state)
     if not stacked:
         check_single("state", state)
 
 
 def check_single(name: str, field: MapState | Field | Baked) -> None:
     """Raises a ValueError if an argument is a stack of maps, outside `jax.vmap`."""
-    voxels = field.sdf if isinstance(field, Baked) else _derived(field).sdf
+    _check_kept(name, field)
+    voxels = _voxels(field)
     axes = np.ndim(voxels) - 3
     if axes:
         raise ValueError(
@@ -387,8 +390,17 @@ def check_single(name: str, field: MapState | Field | Baked) -> None:
         )
 
 
-def _derived(field: MapState | Field) -> Derived:
-    return field.grid.derived if isinstance(field, MapState) else field.surface.derived
+def _check_kept(name: str, field: MapState | Field | Baked) -> None:
+    voxels = _voxels(field)
+    if isinstance(voxels, jax.Array) and not is_traced(voxels) and voxels.is_deleted():
+        raise ValueError(f"{name} was donated to an update, expected the map that it returned")
+
+
+def _voxels(field: MapState | Field | Baked) -> jax.Array:
+    """Selects the distances at the voxels or samples."""
+    if isinstance(field, Baked):
+        return field.sdf
+    return (field.grid if isinstance(field, MapState) else field.surface).derived.sdf
 
 
 def surface_of(grid: Grid) -> Surface:

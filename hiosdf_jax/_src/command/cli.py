@@ -114,6 +114,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except (OSError, MemoryError) as error:
             print(f"hiosdf: {_message(error) or 'out of memory'}", file=sys.stderr)
             return _BAD_INPUT
+        except RuntimeError as error:  # what JAX raises, whose import takes a second
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            print("hiosdf: out of memory; a smaller --bounds takes less", file=sys.stderr)
+            return _BAD_INPUT
         except KeyboardInterrupt:
             print("hiosdf: stopped; nothing was written", file=sys.stderr)
             return 128 + (stopping.received or signal.SIGINT)
@@ -260,6 +265,14 @@ def _check_outputs(options: argparse.Namespace, output: Path) -> None:
     for other in (*filter(None, inputs), *(output / name for name in RESULTS)):
         if options.save.resolve() == other.resolve():
             raise _Failure(f"--save {options.save} would replace {other}", _BAD_INPUT)
+    if options.save.is_file() and not _is_map(options.save):
+        raise _Failure(f"--save {options.save} would replace a file that is no map", _BAD_INPUT)
+
+
+def _is_map(path: Path) -> bool:
+    from hiosdf_jax._src.mapping.checkpoint import is_map
+
+    return is_map(path)
 
 
 def _check_folder(options: argparse.Namespace, output: Path, names: Sequence[str]) -> None:

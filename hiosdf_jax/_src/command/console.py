@@ -26,6 +26,8 @@ class LastingText:
         if self.failure is None:
             try:
                 return self._stream.write(text)
+            except UnicodeEncodeError:  # a file's name that the terminal cannot show
+                self._stream.write(text.encode("ascii", "backslashreplace").decode())
             except OSError as error:
                 self.failure = error
         return len(text)

@@ -130,9 +130,13 @@ def run_stream(
         raise lost[0]
     if mapped.stopped is not None:
         raise mapped.stopped
-    unfinished = output / UNFINISHED  # of this run, or of one that it takes the place of
-    if map_path.resolve() != unfinished.resolve() or save_path is None:
-        unfinished.unlink(missing_ok=True)
+    unfinished = output / UNFINISHED
+    if save_path is None or map_path.resolve() != unfinished.resolve():
+        this_run_wrote_it = resumed is not None or (checkpoint_every and save_path is None)
+        if this_run_wrote_it:
+            unfinished.unlink(missing_ok=True)
+        elif unfinished.exists():
+            print(f"{unfinished} is of an earlier run that was stopped")
     return described
 
 

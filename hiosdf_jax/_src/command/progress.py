@@ -77,6 +77,11 @@ def save_map(path: str | os.PathLike[str], saved: SavedMap) -> None:
     checkpoint.save_with_progress(path, saved.state, notes)
 
 
+def _in_range(notes: dict[str, int]) -> bool:
+    counts = {name: value for name, value in notes.items() if name not in ("digest", "held_out")}
+    return min(counts.values()) >= 0 and notes["seed"] < 2**32
+
+
 def load_map(path: str | os.PathLike[str]) -> SavedMap:
     """Reads a map that `save_map` wrote.
 
@@ -96,7 +101,7 @@ def load_map(path: str | os.PathLike[str]) -> SavedMap:
     fits = isinstance(notes, dict) and {name: type(each) for name, each in notes.items()} == {
         name: type(each) for name, each in expected.items()
     }
-    if not fits or min(notes["next_frame"], notes["seed"]) < 0:
+    if not fits or not _in_range(notes):
         raise ValueError(
             f"{path}: the file does not say how far the map has come in its stream, expected one "
             "that the hiosdf command wrote"

@@ -15,6 +15,7 @@ from hiosdf_jax._src.field.points import query
 from hiosdf_jax._src.numerics.arrays import on_device, scalar
 from hiosdf_jax._src.numerics.intake import as_real, is_traced
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 from hiosdf_jax._src.state import Baked, Field, MapState, check_single, field_of
 
 _CHUNK = 65536  # samples at a time: activations are many times larger than a sample
@@ -64,8 +65,10 @@ def bake(
         center = on_device("center", center)
         if center.shape != (3,):
             raise ValueError(f"center has shape {center.shape}, expected (3,)")
-        if not is_traced(center) and not np.isfinite(center).all():
-            raise ValueError(f"center is {center}, expected finite coordinates, m")
+        if not is_traced(center) and not (np.abs(center) <= FARTHEST_M).all():
+            raise ValueError(
+                f"center is {center}, expected finite coordinates of at most {FARTHEST_M:g} m"
+            )
         corner_world = center - on_device("size", size / 2)
     counts = sample_counts(size, resolution)
     return _bake(field, corner_world, scalar(resolution), counts).replace(window=window)
@@ -77,7 +80,7 @@ def _bake(
     field: Field, corner_world: jax.Array, resolution: jax.Array, shape: tuple[int, int, int]
 ) -> Baked:
     # A NaN point is in collision, and so are all samples where the corner is not finite.
-    known = jnp.all(jnp.isfinite(corner_world))
+    known = jnp.all(jnp.abs(corner_world) <= 2 * FARTHEST_M)  # False for NaN
     corner_world = jnp.where(known, corner_world, jnp.nan)
 
     def sample(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

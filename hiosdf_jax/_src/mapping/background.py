@@ -47,7 +47,8 @@ class BackgroundMapper:
 
     One frame waits while another is fused. A newer frame replaces the waiting one, so that a slow
     machine maps fewer frames and not older ones. Use it in a `with` block, or call `close`. When
-    the interpreter exits, a mapper that is still open finishes the frame that it is fusing.
+    the interpreter exits, a mapper that is still open finishes the frame that it is fusing, which
+    takes longer where the first update is being compiled.
 
     Reading `field` never waits and never raises. A controller that reads nothing else should stop
     where `age(now)` is too large, or `failure` is not None.
@@ -164,7 +165,11 @@ class BackgroundMapper:
         """
         with self._changed:
             done = self._changed.wait_for(
-                lambda: self.failure is not None or (self._waiting is None and not self._busy),
+                lambda: (
+                    self.failure is not None
+                    or not self._thread.is_alive()
+                    or (self._waiting is None and not self._busy)
+                ),
                 timeout_s,
             )
             self._check()

@@ -16,6 +16,8 @@ from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.mapping.pipeline import init
+from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.state import Grid, MapState, Side, check_map
 
@@ -54,10 +56,12 @@ _LIMITS = {
     "grid.surface.sdf": (-2200, 2200),
     "grid.surface.doubt": (0, 2200),
     "grid.surface.side": (min(Side), max(Side)),
-    "network.optimizer.0.count": (0, 2**31 - 1),
+    "network.optimizer.0.count": (0, 2**30),
+    "network.origin_world": (-FARTHEST_M, FARTHEST_M),
     "optimism": (0, np.inf),
-    "updates": (0, 2**31 - 1),
+    "updates": (0, 2**30),
 }
+_MOST_WEIGHT = 1e6  # of the network, and of the optimizer's moments
 
 
 def save(path: str | os.PathLike[str], state: MapState) -> None:
@@ -95,7 +99,11 @@ def save_with_progress(
         ValueError: `state` is not a map.
         OSError: As for `save`.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path is {path!r}, expected the name of a file")
     check_map(state)
+    if is_traced(*jax.tree.leaves(state)):
+        raise ValueError("state is traced, expected a map: call save outside jit")
     header = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -108,6 +116,16 @@ def save_with_progress(
     arrays["header"] = np.asarray(json.dumps(header))
     with replacing(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def is_map(path: str | os.PathLike[str]) -> bool:
+    """Returns whether a file is a map, judged by its header alone."""
+    try:
+        with Archive(path) as archive:
+            _read_header(archive)
+    except ValueError:
+        return False
+    return True
 
 
 def read_progress(path: str | os.PathLike[str]) -> Any:
@@ -215,7 +233,9 @@ def _in_range(path: str | os.PathLike[str], name: str, array: np.ndarray) -> np.
     """Returns an array of a file, or raises a ValueError if no map has such values."""
     if name.startswith("report."):  # what it says decides nothing, and a failed loss is NaN
         return array
-    least, most = _LIMITS.get(name, (-np.inf, np.inf))
+    weights = name.startswith("network.") and array.dtype.kind == "f"
+    unlimited = (-_MOST_WEIGHT, _MOST_WEIGHT) if weights else (-np.inf, np.inf)
+    least, most = _LIMITS.get(name, unlimited)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{path} has {name} with values that are not finite")
     if array.size and not (array.min() >= least and array.max() <= most):

@@ -14,6 +14,8 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+_DEEPEST = 16  # an array has three axes or four
+
 
 def as_real(name: str, values: Any) -> np.ndarray:
     """Checks that an argument is an array of real numbers.
@@ -74,11 +76,19 @@ def as_array(name: str, values: Any) -> np.ndarray | jax.Array:
     """
     if not any(isinstance(leaf, jax.Array) for leaf in _leaves(values)):
         return as_floats(name, values)
+    if isinstance(values, jax.Array) and not is_traced(values) and values.is_deleted():
+        raise ValueError(f"{name} was donated or deleted, expected an array")
     try:
+        if not isinstance(values, jax.Array):
+            for leaf in _leaves(values):
+                if not isinstance(leaf, jax.Array):
+                    as_real(name, leaf)
+        if _has_mask(values):
+            raise ValueError("masks and arrays of JAX are mixed")
         array = values if isinstance(values, jax.Array) else jnp.asarray(values)
         _check_type(name, array)
         return array.astype(jnp.float32)
-    except (TypeError, RuntimeError) as error:  # unequal shapes; memory that was donated
+    except Exception as error:  # unequal shapes, or whatever a foreign object raises
         raise ValueError(f"{name} is no array of numbers: {error}") from error
 
 
@@ -120,12 +130,17 @@ def is_traced(*values: Any) -> bool:
 
 def _leaves(values: Any) -> list[Any]:
     """The members of nested lists and tuples."""
-    return jax.tree.leaves(values, is_leaf=lambda value: not isinstance(value, list | tuple))
+    found, inner = [], [values]
+    for _ in range(_DEEPEST):
+        found += [value for value in inner if not isinstance(value, list | tuple)]
+        inner = [each for value in inner if isinstance(value, list | tuple) for each in value]
+        if not inner:
+            return found
+    raise ValueError(f"lists are nested more than {_DEEPEST} deep, expected an array of numbers")
 
 
 def _has_mask(values: Any) -> bool:
-    inner = values if isinstance(values, list | tuple) else ()
-    return any(np.ma.isMaskedArray(each) for each in (values, *inner))
+    return any(np.ma.isMaskedArray(each) for each in _leaves(values))
 
 
 def _check_type(name: str, array: Any) -> None:

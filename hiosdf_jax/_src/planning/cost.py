@@ -12,6 +12,8 @@ from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.numerics.modes import plain
 
+_LEAST_M, _MOST_M = 1e-9, 1e9  # margins whose square is a float32
+
 
 def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
     """Computes the obstacle cost of CHOMP (Zucker et al., IJRR 2013), zero beyond a margin.
@@ -39,14 +41,16 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
     clearance, margin = on_device("clearance", clearance), on_device("margin_m", margin_m)
     if not is_traced(margin):
         values = np.asarray(jax.device_get(margin))
-        if not ((values > 0) & np.isfinite(values)).all():
-            raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite")
+        if not ((values >= _LEAST_M) & (values <= _MOST_M)).all():
+            raise ValueError(f"margin_m is {margin_m}, expected > 0 and finite: 1e-9 to 1e9 m")
     return _cost(clearance, margin)
 
 
 @jax.jit
 @plain
 def _cost(clearance: jax.Array, margin: jax.Array) -> jax.Array:
+    # Inside jit a margin that is none is as wide as any: no collision may cost nothing.
+    margin = jnp.where((margin >= _LEAST_M) & (margin <= _MOST_M), margin, _MOST_M)
     # Clipped before squaring: an infinite clearance must not make the gradient NaN.
     shortfall = jnp.clip(margin - clearance, 0, margin)
     return shortfall**2 / (2 * margin) + jnp.maximum(-clearance, 0)

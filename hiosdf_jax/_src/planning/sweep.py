@@ -139,8 +139,13 @@ def _checked(
     check_whole("evaluations", evaluations, 2)
     if not is_traced(slope):
         slope = as_number("slope", slope, 0, above=True)
-    return as_field(field), start, end, radii, on_device("slope", slope)
+    slope = on_device("slope", slope)
+    # Inside jit a slope that is none counts as steep: the motion is in collision.
+    slope = jnp.where((slope > 0) & (slope <= _STEEPEST), slope, _STEEPEST)
+    return as_field(field), start, end, radii, slope
 
+
+_STEEPEST = 1e6
 
 _CHOICES = ("unknown", "bound", "evaluations")
 
