@@ -1,4 +1,4 @@
-"""The `hiosdf` command: `hiosdf demo`, `hiosdf map STREAM`."""
+"""The `hiosdf` command: `hiosdf demo | map | view | info`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from hiosdf_jax._src.output_files import check_output, check_output_folder, repl
 if TYPE_CHECKING:
     import numpy as np
 
+    from hiosdf_jax._src.command.live_map import LiveMap
     from hiosdf_jax._src.command.progress import SavedMap
     from hiosdf_jax._src.config import Config
     from hiosdf_jax._src.datasets.stream import Stream
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 _NOTHING_MAPPED, _NOT_REACHED, _BAD_INPUT = 1, 1, 2  # exit codes; argparse itself exits with 2
 _OUTPUT = Path("hiosdf_output")
 _DEMO_FRAMES, _MOST_DEMO_FRAMES = 80, 100_000
+_MOST_PORT = 65535
 _MOST_SEED = 2**32 - 1  # JAX drops higher bits
 _PLAN_RESULTS = ("plan.png", "plan.gif", "metrics.json")
 _SKIP_HINT = " (--skip-bad-frames skips such frames)"
@@ -37,7 +40,10 @@ examples:
   hiosdf demo                           map a simulated apartment, score the map and draw it
   hiosdf demo --plan                    let a robot explore the apartment
   hiosdf map house_depth.npz            map a recorded stream, score the map and draw it
+  hiosdf map house_depth.npz --view     the same, in a browser while the map grows
   hiosdf map --help                     streams, ground truth, and what else a run can do
+  hiosdf view map.npz                   show a saved map in a browser
+  hiosdf info map.npz                   what a saved map is, in plain words
 """
 _DEMO_EXAMPLES = """\
 examples:
@@ -73,6 +79,16 @@ A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C) and SIGTERM end i
 frame with exit code 130 and 143; a second one ends it at once. In each case the map so far is
 scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on with
 it.
+"""
+
+_VIEW_EXAMPLES = """\
+examples:
+  hiosdf view map.npz                        until Ctrl-C, at http://127.0.0.1:8080
+  hiosdf view map.npz --export scene.html    one file that needs no server, and no view
+  hiosdf view map.npz --host 0.0.0.0         other machines can connect, without a password
+
+The map is what --save of hiosdf map, or hio.save, has written. The view needs the extra view: in a
+clone, pip install '.[view]'.
 """
 
 
@@ -136,11 +152,11 @@ def _check_console(out: Any) -> None:
 
 def _check_numbers(options: argparse.Namespace) -> None:
     """Raises a failure for numbers too large to count with."""
-    most = {"seed": _MOST_SEED}
+    most = {"seed": _MOST_SEED, "port": _MOST_PORT}
     if options.command is _demo:
         most["frames"] = _MOST_DEMO_FRAMES
     for name, limit in most.items():
-        value = getattr(options, name)
+        value = getattr(options, name, None)
         if value is not None and value > limit:
             raise _Failure(f"--{name} is {value}, expected at most {limit}", _BAD_INPUT)
 
@@ -183,8 +199,8 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _plan(options: argparse.Namespace) -> None:
-    for name in ("frames", "config", "save", "checkpoint_every", "resume"):
-        if getattr(options, name) is not None:
+    for name in ("frames", "config", "save", "checkpoint_every", "resume", "view", "export"):
+        if getattr(options, name):
             raise _Failure(f"{_option(name)} cannot be combined with --plan", _BAD_INPUT)
     output = options.output or _OUTPUT / "demo_plan"
     _check_folder(options, output, _PLAN_RESULTS)
@@ -253,11 +269,50 @@ def _map(options: argparse.Namespace) -> None:
     )
 
 
+def _view(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.mapping.pipeline import snapshot
+    from hiosdf_jax._src.view.live import Viewer
+
+    if options.export is not None:
+        _checked(lambda: check_output(options.export))
+    state = _checked(lambda: load(options.map))
+    port = 0 if options.export is not None else options.port
+    viewer = _checked(lambda: Viewer(host=options.host, port=port))
+    viewer.show(snapshot(state))
+    if options.export is not None:
+        _checked(lambda: viewer.export(options.export))
+        print(f"wrote {options.export}")
+    else:
+        _wait(options, viewer.url)
+    viewer.close()
+
+
+def _wait(options: argparse.Namespace, url: str) -> None:
+    """Lets a view live until a signal; Ctrl-C is its usual end."""
+    options.stopping.in_order()
+    print(f"the view is at {url} until Ctrl-C", flush=True)
+    while options.stopping.received is None:
+        time.sleep(0.1)
+    if options.stopping.received == signal.SIGINT:
+        options.stopping.received = None
+
+
+def _info(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.command.map_info import describe_map
+    from hiosdf_jax._src.mapping.checkpoint import load
+
+    state = _checked(lambda: load(options.map))
+    print(_checked(lambda: describe_map(options.map, state)))
+
+
 def _check_outputs(options: argparse.Namespace, output: Path) -> None:
     """Raises a failure for outputs that cannot be written, before any work."""
     from hiosdf_jax._src.command.map_stream import RESULTS, UNFINISHED
 
     _check_folder(options, output, (*RESULTS, UNFINISHED))
+    if options.export is not None:
+        _checked(lambda: check_output(options.export))
     if options.save is None:
         return
     _checked(lambda: check_output(options.save))
@@ -405,6 +460,7 @@ def _run(
     if resumed is not None and resumed.held_out != (truth is None):
         was = "without" if resumed.held_out else "with"
         raise _Failure(f"{options.resume} was mapped {was} exact distances", _BAD_INPUT)
+    live = _watch(options, stream, settings["exact_sdf"], output)
     options.stopping.in_order()
     try:
         map_stream.run_stream(
@@ -416,6 +472,7 @@ def _run(
             save_path=options.save,
             checkpoint_every=options.checkpoint_every,
             stop=lambda: options.stopping.received and options.stopping.received.name,
+            live=live,
             **settings,
         )
     except BadFrameError as error:
@@ -430,6 +487,37 @@ def _run(
         map_path = str(map_stream.map_file(output, options.save))
         again = shlex.join(["hiosdf", *_without_resume(options.arguments), "--resume", map_path])
         print(f"stopped by {stop}; to go on:\n  {again}")
+    if live is not None:
+        _end_watch(options, live)
+
+
+def _watch(
+    options: argparse.Namespace,
+    stream: Stream,
+    exact_sdf: Callable[[np.ndarray], np.ndarray] | None,
+    output: Path,
+) -> LiveMap | None:
+    """Starts the view of a growing map, if there is to be one."""
+    if not options.view and options.export is None:
+        return None
+    from hiosdf_jax._src.command.live_map import LiveMap
+
+    port = options.port if options.view else 0
+    button = options.export or output / "scene.html"
+    live = _checked(lambda: LiveMap(stream, exact_sdf, options.host, port, button))
+    if options.view:
+        print(f"the map grows at {live.url}", flush=True)
+    return live
+
+
+def _end_watch(options: argparse.Namespace, live: LiveMap) -> None:
+    """Writes the view if it is to be written, and lets it live on if it is watched."""
+    if options.export is not None:
+        _checked(lambda: live.export(options.export))
+        print(f"wrote {options.export}")
+    if options.view and options.stopping.received is None:
+        _wait(options, live.url)
+    live.close()
 
 
 def _without_resume(arguments: Sequence[str]) -> list[str]:
@@ -496,10 +584,33 @@ def _parser() -> argparse.ArgumentParser:
         help="go on with the map that a run of the same stream has written; its configuration, "
         "bounds and seed are used",
     )
+    common.add_argument(
+        "--view",
+        action="store_true",
+        help="show the map in a browser while it grows, and on until Ctrl-C; needs viser",
+    )
+    served = argparse.ArgumentParser(add_help=False)
+    served.add_argument(
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help="write the view as one HTML file that needs no server; needs viser",
+    )
+    served.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address of the view (default: 127.0.0.1, which only this machine can reach)",
+    )
+    served.add_argument(
+        "--port",
+        type=_whole(0),
+        default=8080,
+        help="port of the view; the next free one is taken (default: 8080)",
+    )
 
     demo = commands.add_parser(
         "demo",
-        parents=[common],
+        parents=[common, served],
         help="map a simulated apartment and score the map",
         description="Map a simulated, furnished apartment, score the map against exact distances\n"
         "and draw it. Or, with --plan, let a robot explore it.",
@@ -528,7 +639,7 @@ def _parser() -> argparse.ArgumentParser:
 
     map_ = commands.add_parser(
         "map",
-        parents=[common],
+        parents=[common, served],
         help="map a recorded stream and score the map",
         description="Map a recorded stream of posed clouds, score the map and draw it.",
         epilog=_MAP_EXAMPLES,
@@ -607,6 +718,25 @@ def _parser() -> argparse.ArgumentParser:
         help="rosbag: frame of the map (default: the root of the tf tree)",
     )
     map_.set_defaults(command=_map)
+
+    view = commands.add_parser(
+        "view",
+        parents=[served],
+        help="show a saved map in a browser",
+        description="Show a saved map in a browser, in three dimensions.",
+        epilog=_VIEW_EXAMPLES,
+        formatter_class=help_style,
+    )
+    view.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    view.set_defaults(command=_view)
+
+    info = commands.add_parser(
+        "info",
+        help="what a saved map is, in plain words",
+        description="Describe a saved map: its extent, updates, memory, problems, configuration.",
+    )
+    info.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    info.set_defaults(command=_info)
     return parser
 
 

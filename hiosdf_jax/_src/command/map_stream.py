@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.command import report
+from hiosdf_jax._src.command.live_map import LiveMap
 from hiosdf_jax._src.command.map_frames import Mapped, fuse_frames, return_freed_memory
 from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
 from hiosdf_jax._src.config import Config
@@ -43,6 +44,7 @@ def run_stream(
     resumed: SavedMap | None = None,
     checkpoint_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
+    live: LiveMap | None = None,
 ) -> dict[str, Any]:
     """Maps a stream, scores and draws the map, and writes everything into a folder.
 
@@ -69,6 +71,7 @@ def run_stream(
         resumed: The map to go on with; of the same configuration and seed.
         checkpoint_every: Number of updates after which the map is written again.
         stop: Is asked before each frame, and ends the mapping by returning something true.
+        live: Shows the map while it grows.
 
     Returns:
         The contents of `metrics.json`.
@@ -85,15 +88,21 @@ def run_stream(
     map_path = map_file(output, save_path)
     lost: list[OSError] = []
 
+    def write(state: MapState, progress: Progress) -> Path:
+        map_path.parent.mkdir(parents=True, exist_ok=True)
+        save_map(map_path, SavedMap(state, progress, seed, truth is None))
+        return map_path
+
     def keep(state: MapState, progress: Progress) -> None:
         try:
-            map_path.parent.mkdir(parents=True, exist_ok=True)
-            save_map(map_path, SavedMap(state, progress, seed, truth is None))
+            write(state, progress)
             lost.clear()
         except OSError as error:  # no reason to lose the map in memory, or the scores and pictures
             lost[:] = [error]
             print(f"the map could not be written: {error}", file=sys.stderr)
 
+    if live is not None:
+        live.begin(write, stop)
     kept = held_out.held_out_frames(len(stream)) if truth is None else range(0)
     mapped = fuse_frames(
         stream,
@@ -105,10 +114,13 @@ def run_stream(
         keep=keep,
         keep_every=checkpoint_every,
         stop=stop,
+        watch=None if live is None else live.watch,
     )
     if save_path is not None or mapped.stopped is not None:
         keep(mapped.state, mapped.progress)
     queries = CompiledQueries(pipeline.snapshot(mapped.state))
+    if live is not None:
+        live.finish(queries.field)
     scores = {}
     if truth is not None:
         scores = _score(queries, mapped, truth)

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from hiosdf_jax._src.output_files import replacing
 
@@ -91,7 +89,7 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
     if not shown.any():
         return np.ones((size[1], size[0], 3))
-    shown[shown] = ~_remains_of_ceiling(vertices @ up, faces[shown], length[shown])
+    shown[shown] = ~remains_of_ceiling(vertices @ up, faces[shown], length[shown])
     normal = normal[shown] / length[shown, None]
     corners = vertices[faces[shown]]  # (F, 3, 3)
 
@@ -130,7 +128,7 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     return np.clip(image, 0, 1)
 
 
-def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
+def remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Returns a mask of the faces of small pieces near the top, remains of a rough ceiling.
 
     Args:
@@ -141,6 +139,9 @@ def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) 
     Returns:
         (F,) bool.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(level), len(level)))
     count, piece = connected_components(graph, directed=False)
