@@ -23,6 +23,7 @@ from hiosdf_jax._src.view.live import Viewer, view
 if TYPE_CHECKING:
     from hiosdf_jax import datasets as datasets
     from hiosdf_jax import demo as demo
+    from hiosdf_jax import exports as exports
     from hiosdf_jax import pictures as pictures
     from hiosdf_jax import scoring as scoring
 
@@ -58,7 +59,7 @@ __all__ = [
     "view",
 ]
 
-_MODULES = ("datasets", "demo", "pictures", "scoring")
+_MODULES = ("datasets", "demo", "exports", "pictures", "scoring")
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -174,3 +174,34 @@ def test_the_vertical_is_an_axis_of_the_world():
             return np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]), pose
 
     np.testing.assert_array_equal(live_map._up_of_stream(Tilted()), [0, 0, 1])
+
+
+def test_a_saved_map_becomes_a_file_of_another_program(saved, tmp_path, capsys):
+    image, floor = tmp_path / "map.vti", tmp_path / "floor.yaml"
+    assert cli.main(["export", str(saved), "--to", str(image), "--resolution", "0.2"]) == 0
+    assert image.read_bytes().startswith(b"<?xml")
+    robot = ["--floor", "-0.56", "--height", "0.6", "--radius", "0.15"]
+    assert cli.main(["export", str(saved), "--to", str(floor), *robot]) == 0
+    assert (tmp_path / "floor.pgm").read_bytes().startswith(b"P5\n48 40\n255\n")
+    assert capsys.readouterr().out == f"wrote {image}\nwrote {floor}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--to", "map.xyz"], "map.xyz: expected a name with .npz, .vti"),
+        (["--to", "floor.pgm"], "a costmap needs floor_m, height_m, radius_m"),
+        (["--to", "none/map.vti"], "none: no such folder"),
+        (["--to", "{saved}"], "--to {saved} would replace a map"),
+        (["--to", "map.vti", "--resolution", "0"], "resolution is 0.0, expected > 0 and finite"),
+        (["--to", "map.vti", "--radius", "1"], ".vti takes no radius_m"),
+    ],
+)
+def test_exports_that_cannot_be_are_one_line(arguments, message, saved, monkeypatch, capsys):
+    monkeypatch.chdir(saved.parent)
+    before = saved.read_bytes()
+    arguments = [each.format(saved=saved) for each in arguments]
+    assert cli.main(["export", str(saved), *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("hiosdf: " + message.format(saved=saved))
+    assert saved.read_bytes() == before and list(saved.parent.iterdir()) == [saved]

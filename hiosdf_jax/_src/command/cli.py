@@ -1,4 +1,4 @@
-"""The `hiosdf` command: `hiosdf demo | map | view | info`."""
+"""The `hiosdf` command: `hiosdf demo | map | view | export | info`."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ examples:
   hiosdf map house_depth.npz --view     the same, in a browser while the map grows
   hiosdf map --help                     streams, ground truth, and what else a run can do
   hiosdf view map.npz                   show a saved map in a browser
+  hiosdf export map.npz --to map.vti    write it for ParaView, ROS, Blender, numpy
   hiosdf info map.npz                   what a saved map is, in plain words
 """
 _DEMO_EXAMPLES = """\
@@ -89,6 +90,20 @@ examples:
 
 The map is what --save of hiosdf map, or hio.save, has written. The view needs the extra view: in a
 clone, pip install '.[view]'.
+"""
+
+_EXPORT_EXAMPLES = """\
+examples:
+  hiosdf export map.npz --to map.vti --resolution 0.1
+      the field for ParaView; .npz has the same for numpy
+  hiosdf export map.npz --to floor.yaml --floor 0 --height 1.2 --radius 0.3
+      a costmap for ROS navigation: floor.yaml and floor.pgm
+  hiosdf export map.npz --to map.glb
+      the mesh for Blender and browsers; .ply has it in the world frame
+  hiosdf export map.npz --to map.safetensors
+      the weights of the network
+  hiosdf export map.npz --to scene.html
+      the view in one file
 """
 
 
@@ -296,6 +311,21 @@ def _wait(options: argparse.Namespace, url: str) -> None:
         time.sleep(0.1)
     if options.stopping.received == signal.SIGINT:
         options.stopping.received = None
+
+
+def _export(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.view.exports.by_suffix import check_suffix, export_map
+
+    _checked(lambda: check_suffix(options.to))
+    _checked(lambda: check_output(options.to))
+    if options.to.is_file() and _is_map(options.to):
+        raise _Failure(f"--to {options.to} would replace a map", _BAD_INPUT)
+    robot = {f"{name}_m": getattr(options, name) for name in ("floor", "height", "radius", "step")}
+    robot = {name: value for name, value in robot.items() if value is not None}
+    state = _checked(lambda: load(options.map))
+    _checked(lambda: export_map(options.to, state, options.resolution, **robot))
+    print(f"wrote {options.to}")
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -729,6 +759,32 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
     view.set_defaults(command=_view)
+
+    export = commands.add_parser(
+        "export",
+        help="write a saved map as a file of another program",
+        description="Write a saved map as a file of another program, by the suffix of its name.",
+        epilog=_EXPORT_EXAMPLES,
+        formatter_class=help_style,
+    )
+    export.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    export.add_argument("--to", type=Path, required=True, metavar="FILE", help="the file to write")
+    export.add_argument(
+        "--resolution",
+        type=float,
+        default=0.05,
+        metavar="M",
+        help="spacing of the samples, edge of a cell or of a triangle, m (default: 0.05)",
+    )
+    robot = export.add_argument_group("costmap")
+    for name, text in {
+        "floor": "height of the floor, m, world frame",
+        "height": "height of the robot, m",
+        "radius": "radius of the robot, m",
+        "step": "what is lower above the floor is no obstacle, m (default: 0.1)",
+    }.items():
+        robot.add_argument(f"--{name}", type=float, metavar="M", help=text)
+    export.set_defaults(command=_export)
 
     info = commands.add_parser(
         "info",

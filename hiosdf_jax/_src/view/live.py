@@ -14,7 +14,6 @@ import numpy as np
 
 from hiosdf_jax._src.mapping.checkpoint import save
 from hiosdf_jax._src.numerics.intake import as_real
-from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.planning.clearance import checked_spheres
 from hiosdf_jax._src.state import Field, MapState, field_of
 from hiosdf_jax._src.view import colors, moments, page, scene, serving, stage
@@ -212,9 +211,7 @@ class Viewer:
             if not self._moments:
                 raise ValueError("nothing is shown yet, expected a map to export")
             kept, look, robot = list(self._moments), self._look, self._spheres
-        document = page.as_html(kept, look, self._given, robot)
-        with replacing(path) as file:
-            file.write(document.encode())
+        page.write_page(path, kept, look, self._given, robot)
 
     def close(self) -> None:
         """Ends the view."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+import os
 
+from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.view import colors, serving, stage
 from hiosdf_jax._src.view.moments import Moment
 
@@ -12,25 +14,29 @@ _MOST_FRAMES = 12  # a snapshot of a house takes about 2 MB
 _SECONDS_PER_FRAME = 0.7
 
 
-def as_html(
+def write_page(
+    path: str | os.PathLike[str],
     moments: list[Moment],
     look: stage.Look,
-    given: stage.Given,
-    spheres: stage.Spheres | None,
-) -> str:
+    given: stage.Given | None = None,
+    spheres: stage.Spheres | None = None,
+) -> None:
     """Writes moments of a map as a page that plays them, with the bars of its colors.
 
     The scene is drawn by a server of its own, so that nobody who watches sees it.
 
     Args:
+        path: The file.
         moments: The moments, oldest first; at most 12 of them are used, the last one always.
         look: What of them is shown.
         given: The truth and the vertical.
         spheres: The spheres of a robot.
 
-    Returns:
-        The page.
+    Raises:
+        OSError: The file cannot be written.
+        ModuleNotFoundError: viser is not installed.
     """
+    given = given or stage.Given()
     step = -(-len(moments) // _MOST_FRAMES)
     played = moments[::-1][::step][::-1]
     server = serving.serve(port=0)
@@ -54,7 +60,8 @@ def as_html(
         f'border:1px solid #ccc;background:#fff" src="data:image/png;base64,{picture}">'
     )
     head, tail = document.rsplit("</body>", 1)
-    return f"{head}{legend}</body>{tail}"
+    with replacing(path) as file:
+        file.write(f"{head}{legend}</body>{tail}".encode())
 
 
 def _as_png(picture: object) -> str:

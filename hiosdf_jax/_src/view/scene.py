@@ -85,6 +85,28 @@ def paint_surface(
     return scale.paint(100 * np.asarray(exact_sdf(vertices), float)), scale
 
 
+def colored_mesh(mesh: trimesh.Trimesh, faces: np.ndarray, painted: np.ndarray) -> trimesh.Trimesh:
+    """Makes a mesh whose colors look in glTF as they do on a screen.
+
+    Args:
+        mesh: The vertices and their normals.
+        faces: (F, 3) the faces to use.
+        painted: (V, 3) uint8, the colors of the vertices.
+
+    Returns:
+        The mesh.
+    """
+    import trimesh
+
+    return trimesh.Trimesh(
+        mesh.vertices,
+        faces,
+        vertex_normals=mesh.vertex_normals,
+        vertex_colors=colors.to_linear(painted),
+        process=False,
+    )
+
+
 def without_specks(mesh: trimesh.Trimesh, up_world: np.ndarray = _UP) -> np.ndarray:
     """Leaves out the upper sides of a rough ceiling, which hide a room from a view from above.
 

@@ -68,8 +68,8 @@ class Given:
         up_world: (3,) unit vector against gravity.
     """
 
-    exact_sdf: Callable[[np.ndarray], np.ndarray] | None
-    up_world: np.ndarray
+    exact_sdf: Callable[[np.ndarray], np.ndarray] | None = None
+    up_world: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
 
 def draw(
@@ -217,15 +217,7 @@ def _draw_surface(
         return []
     painted, scale = scene.paint_surface(moment.mesh, look.color, given.exact_sdf, given.up_world)
     faces = scene.without_specks(moment.mesh, given.up_world)
-    import trimesh
-
-    colored = trimesh.Trimesh(
-        moment.mesh.vertices,
-        faces,
-        vertex_normals=moment.mesh.vertex_normals,
-        vertex_colors=colors.to_linear(painted),
-        process=False,
-    )
+    colored = scene.colored_mesh(moment.mesh, faces, painted)
     with io.BytesIO() as file:
         colored.export(file, file_type="glb")
         server.scene.add_glb("/surface", file.getvalue(), cast_shadow=False, receive_shadow=False)
