@@ -119,7 +119,8 @@ def test_glb_has_the_mesh_with_y_up_and_colors(field, tmp_path):
     np.testing.assert_allclose(np.stack([x, -z, y], axis=1), mesh.vertices, atol=1e-6)
     normals = again.vertex_normals
     np.testing.assert_allclose(normals[:, 1], mesh.vertex_normals[:, 2], atol=1e-4)
-    assert len(np.unique(again.visual.vertex_colors, axis=0)) > 10
+    assert len(np.unique(again.visual.vertex_attributes["color"], axis=0)) > 10
+    assert again.visual.material.metallicFactor == 0.0  # polished metal is the default of glTF
 
 
 def test_html_has_the_view(field, tmp_path):

@@ -104,6 +104,8 @@ examples:
       the weights of the network
   hiosdf export map.npz --to scene.html
       the view in one file
+  hiosdf export hiosdf_output/demo/metrics.json --to metrics.csv
+      the metrics of a run, for a spreadsheet
 """
 
 
@@ -314,6 +316,9 @@ def _wait(options: argparse.Namespace, url: str) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
+    if options.to.suffix == ".csv":
+        _export_metrics(options.map, options.to)
+        return
     from hiosdf_jax._src.mapping.checkpoint import load
     from hiosdf_jax._src.view.exports.by_suffix import check_suffix, export_map
 
@@ -326,6 +331,16 @@ def _export(options: argparse.Namespace) -> None:
     state = _checked(lambda: load(options.map))
     _checked(lambda: export_map(options.to, state, options.resolution, **robot))
     print(f"wrote {options.to}")
+
+
+def _export_metrics(source: Path, target: Path) -> None:
+    import json
+
+    from hiosdf_jax._src.scoring.rows import write_csv
+
+    metrics = _checked(lambda: json.loads(source.read_text("utf-8")))
+    _checked(lambda: write_csv(target, metrics))
+    print(f"wrote {target}")
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -767,7 +782,9 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXPORT_EXAMPLES,
         formatter_class=help_style,
     )
-    export.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    export.add_argument(
+        "map", type=Path, metavar="MAP", help="the file of a map; for .csv, that of the metrics"
+    )
     export.add_argument("--to", type=Path, required=True, metavar="FILE", help="the file to write")
     export.add_argument(
         "--resolution",

@@ -17,8 +17,8 @@ from hiosdf_jax._src.mapping.pipeline import snapshot
 from hiosdf_jax._src.state import Field, MapState
 from hiosdf_jax._src.view.live import Viewer
 
-_SHARE = 0.1  # of the time of the mapping, that drawing may take
-_SENSOR_SECONDS = 0.2  # between two drawings of the newest cloud alone
+_SHARE = 0.08  # of the time of the mapping, that drawing may take
+_SENSOR_SECONDS = 0.25  # between two drawings of the newest cloud alone
 
 
 class Pace:

@@ -11,7 +11,8 @@ from hiosdf_jax._src.view import colors, serving, stage
 from hiosdf_jax._src.view.moments import Moment
 
 _MOST_FRAMES = 12  # a snapshot of a house takes about 2 MB
-_SECONDS_PER_FRAME = 0.7
+_SECONDS_PER_FRAME = 1.0
+_SECONDS_AT_END = 4.0
 
 
 def write_page(
@@ -50,7 +51,7 @@ def write_page(
                 recording.insert_sleep(_SECONDS_PER_FRAME)
             scales = stage.draw(server, moment, look, given, spheres)
         if len(played) > 1:
-            recording.insert_sleep(2 * _SECONDS_PER_FRAME)
+            recording.insert_sleep(_SECONDS_AT_END)
         document = recording.as_html()
     finally:
         serving.stop(server)

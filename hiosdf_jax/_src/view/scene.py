@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -85,26 +86,40 @@ def paint_surface(
     return scale.paint(100 * np.asarray(exact_sdf(vertices), float)), scale
 
 
-def colored_mesh(mesh: trimesh.Trimesh, faces: np.ndarray, painted: np.ndarray) -> trimesh.Trimesh:
-    """Makes a mesh whose colors look in glTF as they do on a screen.
+def as_glb(
+    vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, painted: np.ndarray
+) -> bytes:
+    """Writes a mesh as binary glTF, whose colors look as they do on a screen.
 
     Args:
-        mesh: The vertices and their normals.
-        faces: (F, 3) the faces to use.
+        vertices: (V, 3).
+        normals: (V, 3) unit vectors.
+        faces: (F, 3).
         painted: (V, 3) uint8, the colors of the vertices.
 
     Returns:
-        The mesh.
+        The file.
     """
     import trimesh
 
-    return trimesh.Trimesh(
-        mesh.vertices,
+    mesh = trimesh.Trimesh(
+        vertices,
         faces,
-        vertex_normals=mesh.vertex_normals,
+        vertex_normals=normals,
         vertex_colors=colors.to_linear(painted),
         process=False,
     )
+    with io.BytesIO() as file:
+        mesh.export(file, file_type="glb", tree_postprocessor=_make_dull)
+        return file.getvalue()
+
+
+def _make_dull(tree: dict[str, Any]) -> None:
+    """Gives the meshes of a glTF tree a material; without one they are of polished metal."""
+    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
 
 
 def without_specks(mesh: trimesh.Trimesh, up_world: np.ndarray = _UP) -> np.ndarray:

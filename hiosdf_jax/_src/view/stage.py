@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from hiosdf_jax._src.view.moments import Moment
 if TYPE_CHECKING:
     import viser
 
-_AMBIENT, _SUN = 1.8, 1.6  # together they show a surface that faces the sun in its color
+_AMBIENT, _SUN = 1.9, 1.3  # together pi: a surface that faces the sun has its own color
 _CLOUD, _SENSOR, _PATH = (213, 94, 0), (20, 20, 20), (204, 60, 160)
 
 
@@ -176,6 +175,7 @@ def prepare(server: viser.ViserServer, moment: Moment, given: Given) -> None:
     server.scene.set_up_direction(up)
     # The lights of viser change the hue of colors that are to be read.
     server.scene.configure_default_lights(enabled=False)
+    server.scene.configure_environment_map(None)
     server.scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT)
     server.scene.add_light_directional(
         "/lights/sun", intensity=_SUN, position=tuple(up + 0.4 * _any_level(up))
@@ -196,11 +196,12 @@ def prepare(server: viser.ViserServer, moment: Moment, given: Given) -> None:
     back[level[int(np.argmin(span[level]))]] = -1.0  # the long side lies across the picture
     side = np.cross(back, up)
     reach = float(max(span[level].max(), 1.5 * span[level].min()))
-    middle = middle - 0.12 * reach * side  # the panel covers the right of the picture
+    # The panel covers the right of the picture, and what is near looks larger than what is far.
+    middle = middle + reach * (0.06 * back - 0.15 * side)
     camera = server.initial_camera
     camera.up = up
     camera.look_at = middle
-    camera.position = middle + reach * (0.36 * back + 0.55 * up)
+    camera.position = middle + reach * (0.30 * back + 0.52 * up)
 
 
 def _any_level(up: np.ndarray) -> np.ndarray:
@@ -217,10 +218,9 @@ def _draw_surface(
         return []
     painted, scale = scene.paint_surface(moment.mesh, look.color, given.exact_sdf, given.up_world)
     faces = scene.without_specks(moment.mesh, given.up_world)
-    colored = scene.colored_mesh(moment.mesh, faces, painted)
-    with io.BytesIO() as file:
-        colored.export(file, file_type="glb")
-        server.scene.add_glb("/surface", file.getvalue(), cast_shadow=False, receive_shadow=False)
+    mesh = moment.mesh
+    file = scene.as_glb(mesh.vertices, mesh.vertex_normals, faces, painted)
+    server.scene.add_glb("/surface", file, cast_shadow=False, receive_shadow=False)
     return [scale]
 
 

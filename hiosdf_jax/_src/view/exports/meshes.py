@@ -41,15 +41,9 @@ def write_glb(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    import trimesh
-
     painted, _ = scene.paint_surface(mesh, "height")
-    turned = trimesh.Trimesh(
-        mesh.vertices @ _GLTF_FROM_WORLD.T,
-        mesh.faces,
-        vertex_normals=mesh.vertex_normals @ _GLTF_FROM_WORLD.T,
-        process=False,
+    vertices, normals = (
+        np.asarray(each) @ _GLTF_FROM_WORLD.T for each in (mesh.vertices, mesh.vertex_normals)
     )
-    colored = scene.colored_mesh(turned, np.asarray(mesh.faces), painted)
     with replacing(path) as file:
-        colored.export(file, file_type="glb")
+        file.write(scene.as_glb(vertices, normals, np.asarray(mesh.faces), painted))
