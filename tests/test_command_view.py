@@ -186,15 +186,24 @@ def test_a_saved_map_becomes_a_file_of_another_program(saved, tmp_path, capsys):
     assert capsys.readouterr().out == f"wrote {image}\nwrote {floor}\n"
 
 
+def test_the_metrics_of_a_run_become_a_table(tmp_path, capsys):
+    metrics, table = tmp_path / "metrics.json", tmp_path / "metrics.csv"
+    metrics.write_text('{"updates": 3, "scores": {"near_cm": 0.5}}')
+    assert cli.main(["export", str(metrics), "--to", str(table)]) == 0
+    assert table.read_text() == "name,value\nupdates,3\nscores.near_cm,0.5\n"
+    assert capsys.readouterr().out == f"wrote {table}\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--to", "map.xyz"], "map.xyz: expected a name with .npz, .vti"),
-        (["--to", "floor.pgm"], "a costmap needs floor_m, height_m, radius_m"),
+        (["--to", "floor.pgm"], "a costmap needs --floor, --height and --radius"),
         (["--to", "none/map.vti"], "none: no such folder"),
         (["--to", "{saved}"], "--to {saved} would replace a map"),
         (["--to", "map.vti", "--resolution", "0"], "resolution is 0.0, expected > 0 and finite"),
-        (["--to", "map.vti", "--radius", "1"], ".vti takes no radius_m"),
+        (["--to", "map.vti", "--radius", "1"], "--radius is for .pgm and .yaml"),
+        (["--to", "metrics.csv"], "{saved}: expected the metrics.json of a run"),
     ],
 )
 def test_exports_that_cannot_be_are_one_line(arguments, message, saved, monkeypatch, capsys):

@@ -316,21 +316,30 @@ def _wait(options: argparse.Namespace, url: str) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    if options.to.suffix == ".csv":
-        _export_metrics(options.map, options.to)
-        return
-    from hiosdf_jax._src.mapping.checkpoint import load
-    from hiosdf_jax._src.view.exports.by_suffix import check_suffix, export_map
-
-    _checked(lambda: check_suffix(options.to))
     _checked(lambda: check_output(options.to))
     if options.to.is_file() and _is_map(options.to):
         raise _Failure(f"--to {options.to} would replace a map", _BAD_INPUT)
-    robot = {f"{name}_m": getattr(options, name) for name in ("floor", "height", "radius", "step")}
-    robot = {name: value for name, value in robot.items() if value is not None}
-    state = _checked(lambda: load(options.map))
-    _checked(lambda: export_map(options.to, state, options.resolution, **robot))
+    if options.to.suffix == ".csv":
+        _export_metrics(options.map, options.to)
+    else:
+        _export_map(options)
     print(f"wrote {options.to}")
+
+
+def _export_map(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.view.exports.by_suffix import COSTMAPS, check_suffix, export_map
+
+    suffix = _checked(lambda: check_suffix(options.to))
+    names = ("floor", "height", "radius", "step")
+    robot = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if suffix in COSTMAPS and not {"floor", "height", "radius"} <= robot.keys():
+        raise _Failure("a costmap needs --floor, --height and --radius", _BAD_INPUT)
+    if suffix not in COSTMAPS and robot:
+        raise _Failure(f"--{next(iter(robot))} is for {' and '.join(COSTMAPS)}", _BAD_INPUT)
+    state = _checked(lambda: load(options.map))
+    robot = {f"{name}_m": value for name, value in robot.items()}
+    _checked(lambda: export_map(options.to, state, options.resolution, **robot))
 
 
 def _export_metrics(source: Path, target: Path) -> None:
@@ -338,9 +347,12 @@ def _export_metrics(source: Path, target: Path) -> None:
 
     from hiosdf_jax._src.scoring.rows import write_csv
 
-    metrics = _checked(lambda: json.loads(source.read_text("utf-8")))
+    text = _checked(source.read_bytes)
+    try:
+        metrics = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _Failure(f"{source}: expected the metrics.json of a run", _BAD_INPUT) from error
     _checked(lambda: write_csv(target, metrics))
-    print(f"wrote {target}")
 
 
 def _info(options: argparse.Namespace) -> None:

@@ -242,6 +242,7 @@ class Viewer:
             return
         self._scales = cast(Any, key)
         self._legend.image = colors.draw_bars(*key)
+        self._legend.visible = True
 
     def _place_slice(self, moment: moments.Moment, sensor_world: np.ndarray | None) -> None:
         """Puts the slice halfway between the floor and the sensor, or the middle of the map."""
@@ -279,10 +280,10 @@ class Viewer:
     def _build_panel(self, can_pause: bool) -> None:
         gui, look = self._server.gui, self._look
         self._quiet = False
-        self._title = gui.add_markdown("waiting for a map")
+        self._title = gui.add_markdown("waiting for the first update, which compiles")
         known = ["height", "spread"] + ["error"] * (self._given.exact_sdf is not None)
         self._color = gui.add_dropdown("color by", known, initial_value=look.color)
-        self._legend = gui.add_image(colors.draw_bars([], ["..."]), format="png")
+        self._legend = gui.add_image(colors.draw_bars([], ["..."]), format="png", visible=False)
         self._axis = gui.add_dropdown("slice across", _AXES, initial_value=_AXES[look.axis])
         self._at = gui.add_slider("slice at [m]", -1.0, 1.0, 0.01, 0.0)
         self._time = gui.add_slider("snapshot", 0, 1, 1, 0, visible=False)

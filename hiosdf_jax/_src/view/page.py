@@ -57,7 +57,7 @@ def write_page(
         serving.stop(server)
     picture = _as_png(colors.draw_bars(scales, stage.notes(look)))
     legend = (
-        '<img alt="legend" style="position:fixed;left:12px;bottom:56px;width:300px;z-index:9;'
+        '<img alt="legend" style="position:fixed;right:12px;top:12px;width:300px;z-index:9;'
         f'border:1px solid #ccc;background:#fff" src="data:image/png;base64,{picture}">'
     )
     head, tail = document.rsplit("</body>", 1)

@@ -25,7 +25,7 @@ SUFFIXES = {
     ".html": "the view, in one file; needs viser",
 }
 _LATTICES = (".npz", ".vti")
-_COSTMAPS = (".pgm", ".yaml")
+COSTMAPS = (".pgm", ".yaml")
 _MESHES = (".ply", ".glb")
 
 
@@ -60,7 +60,7 @@ def export_map(
         field = field_of(field)
     if not isinstance(field, Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
-    if suffix in _COSTMAPS:
+    if suffix in COSTMAPS:
         missing = {"floor_m", "height_m", "radius_m"} - robot.keys()
         if missing:
             raise ValueError(f"a costmap needs {', '.join(sorted(missing))}")
