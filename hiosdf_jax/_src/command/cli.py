@@ -52,9 +52,9 @@ examples:
   hiosdf demo --config paper --seed 1   with the numbers of the paper
   hiosdf demo --plan --seed 3           a robot drives from one room to another
 
-The folder gets metrics.json, slices.png, mesh.ply and mesh.png; with --plan it gets metrics.json,
-plan.png and plan.gif. Ctrl-C ends the mapping as it does with hiosdf map; with --plan it ends the
-run at once, and nothing is written.
+The folder gets metrics.json, slices.png, mesh.ply, mesh.png and growing.gif, which shows the map
+grow; with --plan it gets metrics.json, plan.png and plan.gif. Ctrl-C ends the mapping as it does
+with hiosdf map; with --plan it ends the run at once, and nothing is written.
 """
 _MAP_EXAMPLES = """\
 examples:
@@ -212,6 +212,7 @@ def _demo(options: argparse.Namespace) -> None:
         truth=apartment.sample_truth(stream),
         exact_sdf=lambda points_world: signed_distance(stream.model, points_world)[0],
         resumed=resumed,
+        draw_growing=True,
     )
 
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -20,13 +20,19 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
+from hiosdf_jax._src.field.mesh import extract_mesh
 from hiosdf_jax._src.mapping import pipeline
 from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring import held_out, metrics
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state import MapState, field_of
 from hiosdf_jax._src.view import drawing
+from hiosdf_jax._src.view.growing import Stage, save_growing
 
-RESULTS = ("mesh.ply", "mesh.png", "slices.png", "metrics.json")
+if TYPE_CHECKING:
+    import trimesh
+
+RESULTS = ("mesh.ply", "mesh.png", "slices.png", "growing.gif", "metrics.json")
+_STAGES = 12  # of the growing map, that growing.gif shows
 UNFINISHED = "checkpoint.npz"  # the map of a run that has not come to its end
 
 
@@ -45,10 +51,12 @@ def run_stream(
     checkpoint_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
     live: LiveMap | None = None,
+    draw_growing: bool = False,
 ) -> dict[str, Any]:
     """Maps a stream, scores and draws the map, and writes everything into a folder.
 
-    The folder gets `metrics.json`, `slices.png`, `mesh.ply` and `mesh.png`. They take the places of
+    The folder gets `metrics.json`, `slices.png`, `mesh.ply` and `mesh.png`, and `growing.gif` if it
+    is to be drawn. They take the places of
     older ones together, after the last of them is drawn; a run that fails leaves older ones as they
     were. Without ground truth the map is scored on the returns of every tenth frame, which it is
     not given.
@@ -72,6 +80,8 @@ def run_stream(
         checkpoint_every: Number of updates after which the map is written again.
         stop: Is asked before each frame, and ends the mapping by returning something true.
         live: Shows the map while it grows.
+        draw_growing: Draw `growing.gif`, too; with the default configuration it takes about a
+            second for each of 12 pictures.
 
     Returns:
         The contents of `metrics.json`.
@@ -101,6 +111,18 @@ def run_stream(
             lost[:] = [error]
             print(f"the map could not be written: {error}", file=sys.stderr)
 
+    surfaces: list[tuple[int, trimesh.Trimesh]] = []
+    due = set(np.rint(np.linspace(0, len(stream) - 1, _STAGES)).astype(int).tolist())
+    fused = 0
+
+    def watch(state: MapState, progress: Progress, cloud: np.ndarray, pose: np.ndarray) -> None:
+        nonlocal fused
+        fused += 1
+        if draw_growing and progress.next_frame - 1 in due:
+            surfaces.append((fused, extract_mesh(field_of(state), config.voxel_size)))
+        if live is not None:
+            live.watch(state, progress, cloud, pose)
+
     if live is not None:
         live.begin(write, stop)
     kept = held_out.held_out_frames(len(stream)) if truth is None else range(0)
@@ -114,7 +136,7 @@ def run_stream(
         keep=keep,
         keep_every=checkpoint_every,
         stop=stop,
-        watch=None if live is None else live.watch,
+        watch=watch,
     )
     if save_path is not None or mapped.stopped is not None:
         keep(mapped.state, mapped.progress)
@@ -128,10 +150,15 @@ def run_stream(
         returns_world = mapped.held_out_world
         scores["held_out"] = held_out.score_held_out(queries.sdf, queries.observed, returns_world)
     return_freed_memory()
-    print("drawing slices.png, mesh.ply and mesh.png", flush=True)
+    also = "growing.gif, " if draw_growing else ""
+    print(f"drawing {also}slices.png, mesh.ply and mesh.png", flush=True)
     described: dict[str, Any] = {}
     with replacing_together(output, RESULTS) as folder:
         up_world = drawing.draw_map(folder, queries, exact_sdf, mapped.path_world, mapped.up_world)
+        if surfaces:
+            before = len(mapped.path_world) - fused  # positions of a run that this one goes on with
+            stages = [Stage(mesh, mapped.path_world[: before + k]) for k, mesh in surfaces]
+            save_growing(folder / "growing.gif", stages, up_world)
         described = report.describe(mapped, config) | {"stream": name, "seed": seed} | scores
         described["up_world"] = up_world.tolist()
         described["total_s"] = time.perf_counter() - start
