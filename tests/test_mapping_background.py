@@ -158,7 +158,9 @@ def test_a_frame_of_a_wrong_type_is_counted_and_mapping_continues(empty_map, clo
     assert int(mapper.field.updates) == 1
 
 
-@pytest.mark.parametrize("stamp", [None, "soon", "1.5", np.nan, np.inf, 10**400, 1e39, 1.7e9, 1j])
+@pytest.mark.parametrize(
+    "stamp", [None, "soon", "1.5", True, np.nan, np.inf, 10**400, 1e39, 1.7e9, 1j]
+)
 def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
     with hio.BackgroundMapper(empty_map) as mapper:
         with pytest.raises(ValueError, match=r"stamp is .*, expected a finite number of seconds"):
@@ -166,9 +168,19 @@ def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
         assert mapper.wait() is empty_map
 
 
-def test_a_mapper_takes_maps_only(empty_map):
+def test_wrong_arguments_are_named(empty_map):
     with pytest.raises(ValueError, match="state is Field, expected a MapState"):
         hio.BackgroundMapper(hio.snapshot(empty_map))
+    with pytest.raises(ValueError, match="serve is 5, expected a function"):
+        hio.BackgroundMapper(empty_map, serve=5)
+    with hio.BackgroundMapper(empty_map) as mapper:
+        for call in (mapper.wait, mapper.close):
+            for timeout in ("x", np.nan, np.inf, True):
+                with pytest.raises(ValueError, match=r"timeout_s is .*, expected a finite number"):
+                    call(timeout)
+        with pytest.raises(ValueError, match="serve is 'bake'"):
+            mapper.serve = "bake"
+        assert mapper.wait(1e300) is empty_map
 
 
 BAD_FRAMES = {
