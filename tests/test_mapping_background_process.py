@@ -18,6 +18,21 @@ import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.background import child, fusing, worker
 
 HERE = Path(__file__).parent
+START = child._START
+
+
+@pytest.fixture(autouse=True)
+def full_priority(monkeypatch):
+    """On a busy machine these tests would wait for long."""
+    assert "os.nice(19)" in START
+    monkeypatch.setattr(child, "_START", START.replace("os.nice(19)", ""))
+
+
+def test_the_process_has_the_least_priority(empty_map, monkeypatch):
+    monkeypatch.setattr(child, "_START", START)
+    mapper = hio.BackgroundMapper(empty_map, process=True)
+    until(lambda: os.getpriority(os.PRIO_PROCESS, process_of(mapper).pid) == 19)
+    process_of(mapper).kill()
 
 
 def served_around(x):

@@ -26,10 +26,12 @@ import numpy as np
 from hiosdf_jax._src.mapping.background.fusing import Frame, Published, RefusedError, Serve
 from hiosdf_jax._src.state import MapState
 
-# The kernel prefers every other process from the first import on: threads keep the niceness that
-# they were started with.
+# The kernel prefers every other process from the first import on: threads keep the priority that
+# they were started with. A controller in real time would pass its own on.
 _START = """
 import os, signal, sys
+if hasattr(os, "SCHED_OTHER") and os.sched_getscheduler(0) != os.SCHED_OTHER:
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 os.nice(19)
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 from multiprocessing.connection import Connection
@@ -137,7 +139,11 @@ class Child:
             RuntimeError: The process has ended.
             Exception: Anything else that the child raised.
         """
-        result = self._ask("fuse", to_host(frame), pack_serve(serve))
+        try:
+            packed_serve = pack_serve(serve)
+        except ValueError as reason:  # its arguments have changed since it was set
+            raise RefusedError(reason) from reason
+        result = self._ask("fuse", to_host(frame), packed_serve)
         return Published(to_device(result.field), result.stamp)
 
     def fetch(self) -> MapState:
