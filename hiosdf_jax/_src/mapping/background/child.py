@@ -32,7 +32,7 @@ _START = """
 import os, signal, sys
 if hasattr(os, "SCHED_OTHER") and os.sched_getscheduler(0) != os.SCHED_OTHER:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-os.nice(19)
+os.setpriority(os.PRIO_PROCESS, 0, 19)
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 from multiprocessing.connection import Connection
 connection = Connection(int(sys.argv[1]))
