@@ -261,6 +261,7 @@ def test_init_and_queries_name_wrong_arguments(room_map):
         with pytest.raises(ValueError, match="stamp"):
             hio.snapshot(room_map, stamp)
     assert float(jax.jit(hio.snapshot)(room_map, 1.5).stamp) == 1.5
+    assert float(jax.jit(lambda state: hio.snapshot(state, 1.5))(room_map).stamp) == 1.5
     old_style = hio.init(CONFIG, jax.random.PRNGKey(0))
     assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))
 

@@ -22,7 +22,7 @@ from hiosdf_jax._src.mapping.stages import (
 )
 from hiosdf_jax._src.network.training import init_network
 from hiosdf_jax._src.numerics.arrays import on_device
-from hiosdf_jax._src.numerics.intake import as_key, is_traced
+from hiosdf_jax._src.numerics.intake import as_array, as_key, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
     as_traced,
@@ -193,12 +193,11 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
         ValueError: `state` is not a map, or `stamp` is not one number, finite in float32.
     """
     check_map(state, stacked=True)
-    seconds = on_device("stamp", stamp)
-    known = is_traced(stamp) or np.isfinite(jax.device_get(seconds)).all()
-    if seconds.shape != () or not known:
+    seconds = as_array("stamp", stamp)
+    if seconds.shape != () or not (is_traced(seconds) or np.isfinite(jax.device_get(seconds))):
         raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
     field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=seconds)
+    return field.replace(stamp=on_device("stamp", seconds))
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
