@@ -24,7 +24,7 @@ _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)")
 _PICTURE = re.compile(r"(!\[[^\]]*\]\()docs/")
 _CODE = re.compile(r"(^```.*?^```$)", re.M | re.S)
 _EXAMPLE = re.compile(r"^Example:\n((?:    .*(?:\n|\Z)|\n(?=    ))+)", re.M)
-_PROMPT = re.compile(r"^    (?:>>>|\.\.\.) ?", re.M)
+_PROMPT = re.compile(r"    (?:>>>|\.\.\.) ?")
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -91,5 +91,11 @@ class ExamplesAsCode(griffe.Extension):
 
 
 def _as_code(match: re.Match[str]) -> str:
-    lines = _PROMPT.sub("    ", match[1].rstrip("\n"))
-    return f"Example:\n    ```python\n{lines}\n    ```\n\n"
+    lines = match[1].rstrip("\n").split("\n")
+    if any(line.startswith("    >>>") for line in lines):  # what has no prompt is printed
+        prompts = [_PROMPT.match(line) for line in lines]
+        lines = [
+            "    " + (line[prompt.end() :] if prompt else f"# {line.strip()}")
+            for line, prompt in zip(lines, prompts, strict=True)
+        ]
+    return "\n".join(["Example:", "    ```python", *lines, "    ```", "", ""])

@@ -56,9 +56,10 @@ def test_links_and_pictures_lead_somewhere(site):
 
 def test_examples_are_code(site):
     page = (site / "api" / "hiosdf_jax.html").read_text("utf-8")
-    assert "&gt;&gt;&gt;" not in page and ">>>" not in page
-    shown = re.sub(r"<[^>]+>", "", page)
-    assert "with hio.BackgroundMapper(state) as mapper:" in shown
+    assert "<blockquote>" not in page  # what Markdown makes of a prompt
+    blocks = [re.sub(r"<[^>]+>", "", each) for each in re.findall(r"<code>.*?</code>", page, re.S)]
+    assert any(each.startswith("with hio.BackgroundMapper(state) as mapper:\n") for each in blocks)
+    assert any("hio.Flag.BAD_POSE in flags\n# False\n" in each for each in blocks)
 
 
 def test_notebooks_have_their_outputs(site):
