@@ -3,6 +3,7 @@
 import ast
 import importlib
 import importlib.util
+import inspect
 import re
 import shlex
 from pathlib import Path
@@ -170,6 +171,33 @@ def test_names_of_the_package_exist(page):
         assert hasattr(hio, public), public
     for dotted in re.findall(r"`(hiosdf_jax(?:\.\w+)+)", text):
         assert resolve(dotted)
+
+
+MODULES = [hio, *(getattr(hio, each) for each in ("planning", *hio._MODULES))]
+FUNCTIONS = {
+    f"{module.__name__}.{name}": function
+    for module in MODULES
+    for name in module.__all__
+    if inspect.isfunction(function := inspect.unwrap(getattr(module, name)))
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_public_function_has_an_example(name):
+    text = inspect.getdoc(FUNCTIONS[name]) or ""
+    example = re.search(r"^Example:\n((?:    .*\n?|\n(?=    ))+)", text, re.M)
+    assert example, "it has no example"
+    lines = example[1].splitlines()
+    if any(line.startswith("    >>>") for line in lines):
+        lines = [line for line in lines if re.match(r"    (>>>|\.\.\.)", line)]
+    code = ast.parse("\n".join(re.sub(r"^    ((>>>|\.\.\.) ?)?", "", line) for line in lines))
+    called = {ast.unparse(each.func) for each in ast.walk(code) if isinstance(each, ast.Call)}
+    own = name.split(".")[-1]
+    assert any(each.split(".")[-1] == own for each in called), "its example does not call it"
+    for dotted in called:
+        module, _, attribute = dotted.rpartition(".")
+        if module == "hio" or module in hio._MODULES or module == "planning":
+            assert hasattr(hio if module == "hio" else getattr(hio, module), attribute), dotted
 
 
 def rows(heading):

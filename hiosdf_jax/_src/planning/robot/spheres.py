@@ -141,6 +141,13 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
     Raises:
         ValueError: An argument is of a wrong kind, a shape of the poses is wrong, there are fewer
             bodies than the spheres need, or (outside jit) kinematics has not run.
+
+    Example:
+        model = mujoco.MjModel.from_xml_path("examples/rover.xml")
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        spheres = planning.spheres_from_model(model, tolerance_m=0.02)
+        centers_world = planning.place_spheres(spheres, data)
     """
     _check_spheres(spheres)
     if not (hasattr(data, "xpos") and hasattr(data, "xmat")):

@@ -114,6 +114,10 @@ def write_costmap(path: str | os.PathLike[str], grid: Costmap) -> None:
 
     Raises:
         OSError: A file cannot be written.
+
+    Example:
+        grid = exports.costmap(field, floor_m=0.0, height_m=1.2, radius_m=0.3)
+        exports.write_costmap("floor.yaml", grid)  # and floor.pgm
     """
     image, description = Path(path).with_suffix(".pgm"), Path(path).with_suffix(".yaml")
     rows, columns = grid.cells.shape
