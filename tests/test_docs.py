@@ -200,11 +200,18 @@ def test_a_public_function_has_an_example(name):
             assert hasattr(hio if module == "hio" else getattr(hio, module), attribute), dotted
 
 
-def rows(heading):
-    """The rows of the first table below a heading of the architecture page, as lists of cells."""
-    section = ARCHITECTURE.read_text("utf-8").split(f"## {heading}\n")[1]
+def rows(heading, page=ARCHITECTURE):
+    """The rows of the first table below a heading of a page, as lists of cells."""
+    section = page.read_text("utf-8").split(f"## {heading}\n")[1]
     table = re.search(r"^\|.*?\n(?!\|)", section, re.M | re.S)[0]
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+
+
+def test_messages_that_need_help_are_those_of_the_package():
+    files = sorted((ROOT / "hiosdf_jax").rglob("*.py"))
+    source = " ".join(path.read_text("utf-8") for path in files)
+    for message, *_ in rows("What it says", ROOT / "docs" / "troubleshooting.md"):
+        assert message.strip("`") in source, message
 
 
 def test_the_architecture_has_the_stages_in_order():
