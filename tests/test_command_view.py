@@ -1,5 +1,6 @@
-"""`hiosdf map --view`, `hiosdf view` and `hiosdf info`."""
+"""`hiosdf map --view`, `hiosdf view`, and what else there is to do with a saved map."""
 
+import json
 import re
 import signal
 import subprocess
@@ -214,3 +215,24 @@ def test_exports_that_cannot_be_are_one_line(arguments, message, saved, monkeypa
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("hiosdf: " + message.format(saved=saved))
     assert saved.read_bytes() == before and list(saved.parent.iterdir()) == [saved]
+
+
+def test_a_saved_map_is_scored_as_its_run_was(tmp_path, no_pictures, capsys):
+    stream, out = write_range(tmp_path / "room.npz", 6), tmp_path / "out"
+    kept, scores = tmp_path / "map.npz", tmp_path / "scores.json"
+    arguments = ["map", str(stream), *BOX, "--output", str(out), "--save", str(kept)]
+    assert cli.main(arguments) == 0
+    assert cli.main(["eval", str(kept), str(stream), "--to", str(scores)]) == 0
+    run = json.loads((out / "metrics.json").read_text())
+    again = json.loads(scores.read_text())
+    for name, value in again["scores"].items():
+        assert value == pytest.approx(run["scores"][name], nan_ok=True), name
+    assert again["bands"][">50 cm"]["eikonal"] == run["bands"][">50 cm"]["eikonal"]
+    assert "error, visible region" in capsys.readouterr().out
+
+
+def test_a_stream_without_exact_distances_scores_nothing(saved, tmp_path, capsys):
+    stream = write_range(tmp_path / "room.npz", 2, truth=False)
+    assert cli.main(["eval", str(saved), str(stream)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("has no exact distances, expected --ground-truth")

@@ -1,4 +1,4 @@
-"""The `hiosdf` command: `hiosdf demo | map | view | export | info`."""
+"""The `hiosdf` command: `hiosdf demo | map | eval | view | export | info`."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ examples:
   hiosdf demo --plan                    let a robot explore the apartment
   hiosdf map house_depth.npz            map a recorded stream, score the map and draw it
   hiosdf map house_depth.npz --view     the same, in a browser while the map grows
+  hiosdf eval map.npz house_depth.npz   score a saved map against exact distances
   hiosdf map --help                     streams, ground truth, and what else a run can do
   hiosdf view map.npz                   show a saved map in a browser
   hiosdf export map.npz --to map.vti    write it for ParaView, ROS, Blender, numpy
@@ -106,6 +107,13 @@ examples:
       the view in one file
   hiosdf export hiosdf_output/demo/metrics.json --to metrics.csv
       the metrics of a run, for a spreadsheet
+"""
+
+_EVAL_EXAMPLES = """\
+examples:
+  hiosdf eval map.npz house_depth.npz                        the exact distances of the stream
+  hiosdf eval map.npz scans/ --ground-truth house.ply        a mesh of the scene
+  hiosdf eval map.npz house_depth.npz --to metrics.json      and as JSON
 """
 
 
@@ -356,6 +364,28 @@ def _export_metrics(source: Path, target: Path) -> None:
     _checked(lambda: write_csv(target, metrics))
 
 
+def _eval(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.command.map_scores import score_map
+    from hiosdf_jax._src.command.report import write_json
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.scoring import table
+
+    if options.to is not None:
+        _checked(lambda: check_output(options.to))
+    state = _checked(lambda: load(options.map))
+    stream, truth = _open(options)
+    if options.ground_truth is not None:
+        truth, _ = _sample_truth(options.ground_truth, stream, state.config.max_range)
+    if truth is None:
+        reason = "has no exact distances, expected --ground-truth"
+        raise _Failure(f"{options.stream} {reason}", _BAD_INPUT)
+    scores = _checked(lambda: score_map(options.map, state, truth))
+    print(f"{table.format_table(scores['scores'])}\n\n{table.format_bands(scores['bands'])}")
+    if options.to is not None:
+        write_json(options.to, scores)
+        print(f"\nwrote {options.to}")
+
+
 def _info(options: argparse.Namespace) -> None:
     from hiosdf_jax._src.command.map_info import describe_map
     from hiosdf_jax._src.mapping.checkpoint import load
@@ -436,7 +466,7 @@ def _open(options: argparse.Namespace) -> tuple[Stream, GroundTruth | None]:
     from hiosdf_jax._src.datasets.stream import FrameStream
 
     names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
-    chosen = {name: getattr(options, name) for name in names}
+    chosen = {name: getattr(options, name, None) for name in names}
     chosen = {name: value for name, value in chosen.items() if value is not None}
     stream = _checked(lambda: open_stream(options.stream, options.format, **chosen))
     truth = None
@@ -815,6 +845,26 @@ def _parser() -> argparse.ArgumentParser:
     }.items():
         robot.add_argument(f"--{name}", type=float, metavar="M", help=text)
     export.set_defaults(command=_export)
+
+    eval_ = commands.add_parser(
+        "eval",
+        help="score a saved map against exact distances",
+        description="Score a saved map against exact distances, where its stream has observed the\n"
+        "scene: those of an .npz stream (eval_*), or a mesh.",
+        epilog=_EVAL_EXAMPLES,
+        formatter_class=help_style,
+    )
+    eval_.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    eval_.add_argument("stream", type=Path, metavar="STREAM", help="the stream that it was made of")
+    eval_.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="FILE",
+        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        "or a folder with iSDF's sdf.npy and transform.txt",
+    )
+    eval_.add_argument("--to", type=Path, metavar="FILE", help="write the scores as JSON, too")
+    eval_.set_defaults(command=_eval, format=None, frames=None)
 
     info = commands.add_parser(
         "info",
