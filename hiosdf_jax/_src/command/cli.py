@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
 import os
 import shlex
@@ -231,11 +232,14 @@ def _plan(options: argparse.Namespace) -> None:
     output = options.output or _OUTPUT / "demo_plan"
     _check_folder(options, output, _PLAN_RESULTS)
     try:
+        importlib.import_module("skimage.graph")  # the search for paths needs it later
         from hiosdf_jax._src.demo import exploration, picture
     except ModuleNotFoundError as error:
-        if error.name != "jax_mppi":
+        packages = {"jax_mppi": "jax-mppi", "skimage": "scikit-image"}
+        package = packages.get((error.name or "").partition(".")[0])
+        if package is None:
             raise
-        hint = "--plan needs jax-mppi: in a clone, pip install '.[plan]'"
+        hint = f"--plan needs {package}: in a clone, pip install '.[plan]'"
         raise _Failure(hint, _BAD_INPUT) from error
 
     _begin("a robot explores an apartment that it does not know")
@@ -721,7 +725,7 @@ def _parser() -> argparse.ArgumentParser:
         "--plan",
         action="store_true",
         help="let a robot drive to another room, knowing only its own map; --seed also chooses "
-        "start and goal; needs jax-mppi",
+        "start and goal; needs the extra [plan]",
     )
     demo.set_defaults(command=_demo)
 
