@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
 import math
 import os
 import shlex
@@ -78,10 +79,10 @@ The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scor
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
 every tenth frame, which it is not given.
 
-A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C) and SIGTERM end it after the current
-frame with exit code 130 and 143; a second one ends it at once. In each case the map so far is
-scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on with
-it.
+A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it after the
+current frame with exit code 130, 143 and 129; a second one ends it at once. In each case the map so
+far is scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on
+with it.
 """
 
 _VIEW_EXAMPLES = """\
@@ -561,6 +562,7 @@ def _run(
             output,
             truth=truth,
             resumed=resumed,
+            resume_path=options.resume,
             save_path=options.save,
             checkpoint_every=options.checkpoint_every,
             stop=lambda: options.stopping.received and options.stopping.received.name,
@@ -577,7 +579,8 @@ def _run(
         if not stop.mapped:
             raise KeyboardInterrupt from stop
         map_path = str(map_stream.map_file(output, options.save))
-        again = shlex.join(["hiosdf", *_without_resume(options.arguments), "--resume", map_path])
+        command, *rest = _without_resume(options.arguments)
+        again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
         print(f"stopped by {stop}; to go on:\n  {again}")
     if live is not None:
         _end_watch(options, live)
@@ -615,10 +618,11 @@ def _end_watch(options: argparse.Namespace, live: LiveMap) -> None:
 def _without_resume(arguments: Sequence[str]) -> list[str]:
     """The arguments without the option --resume and its value."""
     kept = []
-    for argument, before in zip(arguments, ["", *arguments], strict=False):
+    names = itertools.takewhile(lambda argument: argument != "--", arguments)
+    for argument, before in zip(names, ["", *arguments], strict=False):
         if "--resume" not in (argument, before) and not argument.startswith("--resume="):
             kept.append(argument)
-    return kept
+    return kept + list(itertools.dropwhile(lambda argument: argument != "--", arguments))
 
 
 def _checked[Result](call: Callable[[], Result], code: int = _BAD_INPUT) -> Result:

@@ -48,6 +48,7 @@ def run_stream(
     save_path: str | os.PathLike[str] | None = None,
     skip_bad_frames: bool = False,
     resumed: SavedMap | None = None,
+    resume_path: str | os.PathLike[str] | None = None,
     checkpoint_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
     live: LiveMap | None = None,
@@ -77,6 +78,8 @@ def run_stream(
             to `checkpoint.npz` in the folder, and only while the run has not come to its end.
         skip_bad_frames: Skip bad frames and count them.
         resumed: The map to go on with; of the same configuration and seed.
+        resume_path: Its file, which this run may replace and, at its end, remove. A map of another
+            run is renamed before one that is not finished takes its place.
         checkpoint_every: Number of updates after which the map is written again.
         stop: Is asked before each frame, and ends the mapping by returning something true.
         live: Shows the map while it grows.
@@ -96,11 +99,16 @@ def run_stream(
     output = Path(output)
     start = time.perf_counter()
     map_path = map_file(output, save_path)
+    ours = set() if resume_path is None else {Path(resume_path).resolve()}  # this run's maps
     lost: list[OSError] = []
 
     def write(state: MapState, progress: Progress) -> Path:
         map_path.parent.mkdir(parents=True, exist_ok=True)
+        place = map_path.resolve()
+        if place not in ours and progress.next_frame < len(stream):
+            _set_aside(place)
         save_map(map_path, SavedMap(state, progress, seed, truth is None))
+        ours.add(place)
         return map_path
 
     def keep(state: MapState, progress: Progress) -> None:
@@ -171,8 +179,7 @@ def run_stream(
         raise mapped.stopped
     unfinished = output / UNFINISHED
     if save_path is None or map_path.resolve() != unfinished.resolve():
-        this_run_wrote_it = resumed is not None or (checkpoint_every and save_path is None)
-        if this_run_wrote_it:
+        if unfinished.resolve() in ours:
             unfinished.unlink(missing_ok=True)
         elif unfinished.exists():
             print(f"{unfinished} is of an earlier run that was stopped")
@@ -190,6 +197,17 @@ def map_file(output: Path, save_path: str | os.PathLike[str] | None) -> Path:
         The file.
     """
     return output / UNFINISHED if save_path is None else Path(save_path)
+
+
+def _set_aside(path: Path) -> None:
+    """Renames a map of another run, which a map that is not finished would replace."""
+    if not path.is_file():
+        return
+    number = 1
+    while (aside := path.with_stem(f"{path.stem}.{number}")).exists():
+        number += 1
+    path.rename(aside)
+    print(f"{path} is of another run: kept as {aside.name}")
 
 
 def _score(queries: CompiledQueries, mapped: Mapped, truth: GroundTruth) -> dict[str, Any]:
