@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.grid.evidence import EvidenceWindow
+from hiosdf_jax._src.grid.evidence import EvidenceWindow, rounded
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
@@ -24,6 +24,9 @@ EXTENT_DEVIATIONS = 0.9 * 3**0.5
 
 # Shorter axes (voxels) are stored with this length, so that a perfect plane keeps its normal.
 _LEAST_DEVIATION = 1e-3
+
+# What two patches of one voxel may become, voxels; a longer axis is no axis to `load`.
+_LONGEST_DEVIATION = 0.99
 
 # The direction of shorter axes (voxels; twice the least) is rounding noise.
 _LEAST_DIRECTED = 2e-3
@@ -139,6 +142,40 @@ def _face_sensor(deviation: jax.Array, direction: jax.Array, to_sensor: jax.Arra
     return jnp.stack([first, jnp.cross(normal, first), normal], axis=1)
 
 
+def axes_of(spread: jax.Array, facing: jax.Array) -> jax.Array:
+    """Makes the axes of patches from the moments of several.
+
+    Args:
+        spread: Covariance of the hits, (N, 3, 3) voxels^2.
+        facing: Mean of the normals, (N, 3): the new normal is on this side.
+
+    Returns:
+        As in `Evidence`, (N, 3, 3).
+    """
+    deviation, direction = principal_axes(spread)
+    direction = _face_sensor(deviation, direction, facing)
+    return jnp.clip(deviation, _LEAST_DEVIATION, _LONGEST_DEVIATION)[..., None] * direction
+
+
+def keep_surfaces(config: Config, window: EvidenceWindow, surface: jax.Array) -> EvidenceWindow:
+    """Limits the passes of patches that were surface, so that adding them up carves none.
+
+    Args:
+        config: The map's configuration.
+        window: Evidence that was added up, faded and not rounded.
+        surface: Voxels in which a part of it was surface, (X, Y, Z) bool.
+
+    Returns:
+        The evidence, by which all of these voxels are surface, also when stored.
+    """
+    hits = jnp.where(surface, jnp.maximum(window.hits, config.min_hits), window.hits)
+    axes = rounded(window.axes)
+    stays = is_feature(config, rounded(hits), rounded(window.passes), axes)
+    most = 0.998 * hits * (1 / least_hit_ratio(config, axes) - 1)
+    limited = jnp.clip(window.passes, -most, most)
+    return window._replace(hits=hits, passes=jnp.where(surface & ~stays, limited, window.passes))
+
+
 def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Array) -> jax.Array:
     """Returns a mask of the voxels whose patch counts as surface.
 
@@ -155,12 +192,25 @@ def is_feature(config: Config, hits: jax.Array, passes: jax.Array, axes: jax.Arr
     Returns:
         (...) bool.
     """
+    ratio = least_hit_ratio(config, axes)
+    return (hits >= config.min_hits) & (hits >= ratio * (hits + jnp.abs(passes)))
+
+
+def least_hit_ratio(config: Config, axes: jax.Array) -> jax.Array:
+    """Returns the share of rays that must have ended on patches, (...).
+
+    Args:
+        config: The map's configuration.
+        axes: As in `Evidence`, (..., 3, 3).
+
+    Returns:
+        hits / (hits + passes) below which the patch is carved.
+    """
     long, middle = (
         length(split(axes[..., axis, :].astype(jnp.float32))) * EXTENT_DEVIATIONS for axis in (0, 1)
     )
     area = jnp.minimum(2 * long, 1) * jnp.minimum(2 * middle, 1)
-    ratio = config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
-    return (hits >= config.min_hits) & (hits >= ratio * (hits + jnp.abs(passes)))
+    return config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
 
 
 def is_doubtful(hits: jax.Array, passes: jax.Array) -> jax.Array:
