@@ -19,12 +19,14 @@ from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
+from hiosdf_jax._src.view.live import Viewer, view
 
 if TYPE_CHECKING:
     from hiosdf_jax import datasets as datasets
     from hiosdf_jax import demo as demo
+    from hiosdf_jax import exports as exports
+    from hiosdf_jax import pictures as pictures
     from hiosdf_jax import scoring as scoring
-    from hiosdf_jax import view as view
 
 __version__ = "0.1.0"
 
@@ -38,6 +40,7 @@ __all__ = [
     "Query",
     "Registration",
     "Report",
+    "Viewer",
     "bake",
     "correct",
     "extract_mesh",
@@ -57,9 +60,10 @@ __all__ = [
     "snapshot",
     "transform",
     "update",
+    "view",
 ]
 
-_MODULES = ("datasets", "demo", "scoring", "view")
+_MODULES = ("datasets", "demo", "exports", "pictures", "scoring")
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -46,6 +46,10 @@ def cloud_stream(
         FileNotFoundError: A file or folder is missing.
         ValueError: The trajectory is malformed, missing, or does not fit the clouds.
         ModuleNotFoundError: There are .pcd files and pypcd4 is not installed.
+
+    Example:
+        stream = datasets.cloud_stream("scans", trajectory="poses.txt")
+        cloud, pose = stream[0]
     """
     folder = Path(folder)
     clouds = sorted((p for p in folder.iterdir() if p.suffix in _READERS), key=_natural)

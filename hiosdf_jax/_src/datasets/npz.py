@@ -191,6 +191,10 @@ def read_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is no npz file, or some of the keys are missing or misshapen.
+
+    Example:
+        truth = datasets.read_truth("house_depth.npz")
+        print(truth.points_world.shape, truth.sdf.shape)
     """
     keys = ("visible", "visible_sdf", "visible_grad", "visible_frame", "surface")
     keys = tuple(f"eval_{key}" for key in keys)

@@ -61,6 +61,10 @@ def rosbag_stream(
         ValueError: The bag cannot be read, a topic is missing or ambiguous, or the bag does not
             contain the motion of the sensor.
         ModuleNotFoundError: rosbags is not installed.
+
+    Example:
+        stream = datasets.rosbag_stream("drive", cloud_topic="/points", odometry_topic="/odom")
+        cloud, pose = stream[0]
     """
     try:
         from rosbags.highlevel import AnyReader

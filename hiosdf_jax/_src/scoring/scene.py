@@ -70,6 +70,10 @@ def read_scene(path: str | os.PathLike[str], sensor_path_world: np.ndarray) -> S
         FileNotFoundError: There is no such file.
         ValueError: The file cannot be read as a mesh or a grid.
         ModuleNotFoundError: A mesh needs libigl, which is not installed.
+
+    Example:
+        rays = scoring.read_rays(stream, max_range=6.0)
+        scene = scoring.read_scene("house.ply", scoring.sensor_path(rays))
     """
     path = Path(path)
     path.stat()
@@ -101,6 +105,10 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
         ValueError: The mesh has no triangles, or corners that are not finite; or the path is not
             (F, 3), finite, F > 0.
         ModuleNotFoundError: libigl is not installed.
+
+    Example:
+        path_world = scoring.sensor_path(scoring.read_rays(stream))
+        scene = scoring.mesh_scene(trimesh.load("house.ply"), path_world)
     """
     vertices, faces, tree = triangle_tree(mesh)
     positions = _spread_positions(sensor_path_world)
