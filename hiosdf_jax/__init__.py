@@ -14,6 +14,7 @@ from hiosdf_jax._src.field.points import query, sdf, sdf_and_grad
 from hiosdf_jax._src.mapping.background.mapper import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
+from hiosdf_jax._src.mapping.merging import correct, merge, transform
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
@@ -41,11 +42,13 @@ __all__ = [
     "Report",
     "Viewer",
     "bake",
+    "correct",
     "extract_mesh",
     "forget",
     "grow",
     "init",
     "load",
+    "merge",
     "moving_rows",
     "pad_cloud",
     "planning",
@@ -55,6 +58,7 @@ __all__ = [
     "sdf",
     "sdf_and_grad",
     "snapshot",
+    "transform",
     "update",
     "view",
 ]

@@ -8,7 +8,8 @@ What has failed in users' stacks, and the test of it. Those without a file are i
     test_gradients_by_the_float_leaves_of_a_map
     test_gradients_by_a_whole_map_need_allow_int
 - derivatives through update
-    test_a_derivative_through_update_is_refused_with_what_to_do
+    test_mapping_gradients.test_the_gradient_equals_finite_differences
+    test_mapping_gradients.test_forward_mode_and_scans_are_traced
 - jax.make_mesh with Explicit axes
     test_explicit_axes_as_make_mesh_has_them
     test_gradients_with_explicit_axes
@@ -281,28 +282,6 @@ def test_gradients_by_a_whole_map_need_allow_int(fields):
         jax.grad(total)(fields["baked"])
     gradient = jax.grad(total, allow_int=True)(fields["baked"])
     assert np.abs(gradient.sdf).max() > 0 and gradient.updates.dtype == jax.dtypes.float0
-
-
-@pytest.mark.parametrize("argument", ["cloud", "pose", "map", "robot"])
-@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
-def test_a_derivative_through_update_is_refused_with_what_to_do(empty_map, argument, derivative):
-    cloud, pose = map(jnp.asarray, stream(1)[0])
-    robot = jnp.zeros((2, 3), jnp.float32)
-    given = {"cloud": cloud, "pose": pose, "map": empty_map.differentiable(), "robot": robot}
-
-    @jax.jit
-    def loss(value):
-        values = given | {argument: value}
-        state = empty_map.combine(values["map"])
-        radii = jnp.full(2, 0.1, jnp.float32)
-        state = hio.update(state, values["cloud"], values["pose"], robot=(values["robot"], radii))
-        return hio.sdf(state, POINTS).sum()
-
-    with pytest.raises(TypeError, match=r"update has no derivative.*stop_gradient.*refine_pose"):
-        jax.eval_shape(derivative(loss), given[argument])
-    if derivative is jax.grad and argument == "pose":
-        still = jax.grad(lambda value: loss(jax.lax.stop_gradient(value)))
-        assert jax.eval_shape(still, pose).shape == (4, 4)
 
 
 def test_flax_writes_and_reads_a_map(room_map, empty_map):

@@ -22,7 +22,6 @@ from hiosdf_jax._src.mapping.stages import (
 )
 from hiosdf_jax._src.network.training import init_network
 from hiosdf_jax._src.numerics.arrays import on_device
-from hiosdf_jax._src.numerics.gradient import refuse_derivatives
 from hiosdf_jax._src.numerics.intake import as_array, as_key, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
@@ -85,13 +84,6 @@ def init(config: Config, key: jax.Array) -> MapState:
     )
 
 
-_NO_DERIVATIVE = (
-    "update has no derivative by the cloud, the pose or the map: rays cross voxels or do not; "
-    "use jax.lax.stop_gradient on its arguments, hiosdf_jax.refine_pose for poses, or gradients of "
-    "queries by points and by field.differentiable()"
-)
-
-
 def update(
     state: MapState,
     cloud: Any,
@@ -132,7 +124,6 @@ def update(
         ValueError: A shape is wrong. Outside jit also: the pose is not finite, not rigid or farther
             than 100 km from the origin, the cloud has no finite row, or a value of `robot` or
             `noise` is out of range, such as a radius above 5 m.
-        TypeError: A derivative through the update is taken.
 
     Warns:
         UserWarning: Outside jit, if almost no return is in range, which refuses the cloud, or
@@ -147,9 +138,7 @@ def update(
     check_map(state)
     extras = check_extras(robot, noise)
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
-        inputs = (state.differentiable(), *as_traced(cloud, pose), *extras)
-        floats, *rest = refuse_derivatives(inputs, _NO_DERIVATIVE)
-        return _update(state.combine(floats), *rest)
+        return _update(state, *as_traced(cloud, pose), *extras)
     compiled = _update_donating if donate else _update_jit
     config = state.config
     cloud, pose = prepare(cloud, pose, config.max_points)

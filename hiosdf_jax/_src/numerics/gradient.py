@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,30 +22,6 @@ def value_and_gradient(
     """
     value, pull = jax.vjp(function, points)
     return value, pull(jnp.ones_like(value))[0]
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def refuse_derivatives(tree: Any, reason: str) -> Any:
-    """Returns arrays as they are, and raises when a derivative by them is taken.
-
-    Args:
-        tree: Arrays.
-        reason: The message.
-
-    Returns:
-        The same arrays.
-
-    Raises:
-        TypeError: A derivative is taken.
-    """
-    del reason
-    return tree
-
-
-@refuse_derivatives.defjvp
-def _raise(reason: str, primals: Any, tangents: Any) -> Any:
-    del primals, tangents
-    raise TypeError(reason)
 
 
 def least(values: jax.Array) -> jax.Array:
