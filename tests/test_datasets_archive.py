@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import struct
 import tracemalloc
 import warnings
@@ -256,9 +257,10 @@ def test_every_field_of_the_header_is_required(honest, tmp_path):
     ):
         write_entries(path, edited(entries, **changes), zipfile.ZIP_STORED)
         check_refused(honest, "map", path, message)
-    for name in ("grid.color", "../../outside"):
+    for name in ("grid.color", "../../outside", "two\nlines", "\x1b[31mred"):
         write_entries(path, entries | {f"{name}.npy": entry(np.zeros(3))}, zipfile.ZIP_STORED)
-        check_refused(honest, "map", path, f"has the unknown array {name}")
+        shown = name if name.isprintable() else re.escape(repr(name))
+        check_refused(honest, "map", path, f"has the unknown array {shown}")
 
 
 def test_values_that_no_map_has_are_refused(honest, tmp_path):

@@ -49,6 +49,7 @@ def write_poses(path, stamps):
         ([1403636579763555584 + 10**8 * i for i in range(4)], None),
         (["9", "10", "11", "100"], [0.1, 0.2, 0.3, 0.4]),
         (["scan_2", "scan_10", "scan_11", "scan_200"], [0.1, 0.2, 0.3, 0.4]),
+        (["2", "10", "11\u00b2", "200"], [0.1, 0.2, 0.3, 0.4]),  # a digit that is no number
     ],
 )
 def test_folders_of_clouds(tmp_path, names, stamps, suffix):

@@ -65,7 +65,7 @@ def cloud_stream(
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key that puts 2 before 10."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in _parts(path.stem)]
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in _parts(path.stem)]
 
 
 def _parts(text: str) -> list[str]:

@@ -167,7 +167,8 @@ def load(path: str | os.PathLike[str]) -> MapState:
         expected = _named_leaves(template)
         later = {name for since, names in _SINCE.items() if version < since for name in names}
         for name in sorted(archive.names - {"header"} - expected.keys() | archive.names & later):
-            raise ValueError(f"{path} has the unknown array {name}")
+            shown = name if name.isprintable() else ascii(name)
+            raise ValueError(f"{path} has the unknown array {shown}")
         for name, leaf in expected.items():  # all, before one is inflated
             if name not in archive.names | later:
                 raise ValueError(f"{path} lacks the array {name}")
