@@ -182,8 +182,9 @@ def _leaves(values: Any) -> list[Any]:
 
 
 def _is_boolean(value: Any) -> bool:
-    dtype = value.dtype if isinstance(value, np.ndarray | jax.Array) else None
-    return isinstance(value, bool | np.bool_) or dtype == bool
+    if isinstance(value, np.ndarray | jax.Array):
+        return bool(jnp.issubdtype(value.dtype, np.bool_))
+    return isinstance(value, bool | np.bool_)
 
 
 def _has_mask(values: Any) -> bool:
