@@ -226,6 +226,17 @@ def test_a_large_array_needs_a_large_file(tmp_path):
         assert not archive.read("zeros", whole=True).any()
 
 
+def test_all_arrays_together_need_a_large_file(tmp_path):
+    path = tmp_path / "zeros.npz"
+    np.savez_compressed(path, **{name: np.zeros(4_000_000) for name in "abc"})
+    with Archive(path) as archive:
+        assert not archive.read("a").any() and not archive.read("b").any()
+        with pytest.raises(
+            ValueError, match=r"takes 3.2e\+07 bytes, expected at most 3.11e\+06 of"
+        ):
+            archive.read("c")
+
+
 def edited(entries, **changes):
     head = json.loads(str(np.load(io.BytesIO(entries["header.npy"]))))
     config = head["config"] | changes.pop("config", {})
