@@ -553,7 +553,8 @@ def _parser() -> argparse.ArgumentParser:
         "--ground-truth",
         type=Path,
         metavar="FILE",
-        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        help="score against the scene: a triangle mesh (.ply, .obj, .stl, .off or .glb) in the "
+        "stream's world frame and in meters, "
         "or a folder with iSDF's sdf.npy and transform.txt",
     )
 
