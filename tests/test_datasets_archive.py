@@ -278,6 +278,7 @@ def test_values_that_no_map_has_are_refused(honest, tmp_path):
     _, entries, _, _ = honest["map"]
     path = tmp_path / "map.npz"
     weights = next(name for name in entries if name.startswith("network.params"))
+    second_moment = next(name for name in entries if name.startswith("network.optimizer.0.nu."))
     for name, value, message in (
         (weights, np.nan, "has network.params.* with values that are not finite"),
         ("grid.surface.mean.npy", np.inf, "has grid.surface.mean with values that are not finite"),
@@ -286,6 +287,23 @@ def test_values_that_no_map_has_are_refused(honest, tmp_path):
         ("grid.surface.sdf.npy", 6e4, "has grid.surface.sdf from"),
         ("grid.surface.side.npy", 4, "has grid.surface.side from .* to 4, expected"),
         ("optimism.npy", -1e9, "has optimism from -1000000000.0 to"),
+        ("grid.surface.nearest.npy", 127, "has grid.surface.nearest without a patch there"),
+        ("grid.surface.nearest.npy", 0, "has grid.surface.nearest without a patch there"),
+        ("grid.surface.sdf.npy", -0.5, "has grid.surface.sdf without a patch, expected 1"),
+        ("grid.surface.side.npy", 1, "has grid.surface.sdf without a patch, expected 1"),
+        ("grid.surface.doubt.npy", 100.0, "has grid.surface.doubt beyond 1"),
+        ("grid.surface.frontier.npy", -128, "has grid.surface.frontier from -128 to"),
+        ("grid.surface.frontier.npy", 127, "has grid.surface.frontier of the wrong sign"),
+        ("grid.change.npy", -128, "has grid.change from -128 to"),
+        ("grid.change.npy", 9, "has grid.change from 0 to 9, expected -72 to 8"),
+        ("optimism.npy", 1e30, "has optimism from 1.* to .*, expected 0 to 424"),
+        ("report.refused_in_row.npy", -1, "has report.refused_in_row from -1 to"),
+        ("report.refused_in_row.npy", 2**31 - 1, "has report.refused_in_row from"),
+        ("report.flags.npy", 2**31, "has report.flags from"),
+        ("report.update_flags.npy", 2**31, "has report.update_flags from"),
+        ("report.points_used.npy", -1, "has report.points_used from -1 to"),
+        ("report.sdf_loss.npy", -1.0, "has report.sdf_loss from -1.0 to"),
+        (second_moment, -1.0, "has network.optimizer.0.nu.* from -1.0 to"),
         ("updates.npy", -1, "has updates from -1 to -1, expected 0"),
         (weights, 3e38, "has network.params.* from .* to 3"),
         ("network.origin_world.npy", 3e38, "has network.origin_world from .* to 3"),
