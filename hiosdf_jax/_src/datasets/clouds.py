@@ -21,6 +21,7 @@ from typing import BinaryIO
 import numpy as np
 
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
+from hiosdf_jax._src.datasets.inflating import most_inflated
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses
 
@@ -182,6 +183,10 @@ def _check_declared(file: BufferedReader) -> None:
         least, inflated = struct.unpack("<II", file.read(8))
         if inflated != size:
             raise ValueError(f"it inflates to {inflated} bytes, expected {size}")
+        if inflated > most_inflated(rest):
+            raise ValueError(
+                f"it inflates to {inflated} bytes, expected at most {most_inflated(rest)}"
+            )
     most = most_returns(rest)
     if header.points > most or values > _PCD_VALUES:
         raise ValueError(
