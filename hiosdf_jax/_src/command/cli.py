@@ -428,9 +428,11 @@ def _check_folder(options: argparse.Namespace, output: Path, names: Sequence[str
     _checked(lambda: check_output_folder(output, names))
     if not output.is_dir():
         return
+    from hiosdf_jax._src.datasets.open import holds_recording
+
     stream = getattr(options, "stream", None)
-    clouds = {each.name for each in output.iterdir() if each.suffix in (".ply", ".pcd")}
-    if clouds - {"mesh.ply"} or (stream and output.resolve() == stream.resolve()):
+    is_stream = stream and output.resolve() == stream.resolve()
+    if is_stream or _checked(lambda: holds_recording(output, apart=["mesh.ply"])):
         raise _Failure(f"{output}: holds a recording, expected a folder for results", _BAD_INPUT)
 
 
@@ -758,7 +760,8 @@ def _parser() -> argparse.ArgumentParser:
         "--ground-truth",
         type=Path,
         metavar="FILE",
-        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        help="score against the scene: a triangle mesh (.ply, .obj, .stl, .off or .glb) in the "
+        "stream's world frame and in meters, "
         "or a folder with iSDF's sdf.npy and transform.txt",
     )
 
