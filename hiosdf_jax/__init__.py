@@ -17,6 +17,8 @@ from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
+from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
+from hiosdf_jax._src.mapping.tracking import predict_pose, track
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ __all__ = [
     "MapState",
     "Query",
     "Registration",
+    "Relocalization",
     "Report",
     "bake",
     "extract_mesh",
@@ -46,12 +49,15 @@ __all__ = [
     "moving_rows",
     "pad_cloud",
     "planning",
+    "predict_pose",
     "query",
     "refine_pose",
+    "relocalize",
     "save",
     "sdf",
     "sdf_and_grad",
     "snapshot",
+    "track",
     "update",
 ]
 

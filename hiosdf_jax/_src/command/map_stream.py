@@ -15,17 +15,18 @@ import numpy as np
 from hiosdf_jax._src.command import report
 from hiosdf_jax._src.command.map_frames import Mapped, fuse_frames, return_freed_memory
 from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
+from hiosdf_jax._src.command.tracker import TRAJECTORY, Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.mapping import checkpoint, pipeline
 from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring import held_out, metrics
 from hiosdf_jax._src.state import MapState
 from hiosdf_jax._src.view import drawing
 
-RESULTS = ("mesh.ply", "mesh.png", "slices.png", "metrics.json")
+RESULTS = (*TRAJECTORY, "mesh.ply", "mesh.png", "slices.png", "metrics.json")
 UNFINISHED = "checkpoint.npz"  # the map of a run that has not come to its end
 
 
@@ -43,6 +44,7 @@ def run_stream(
     resumed: SavedMap | None = None,
     checkpoint_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
+    tracker: Tracker | None = None,
 ) -> dict[str, Any]:
     """Maps a stream, scores and draws the map, and writes everything into a folder.
 
@@ -69,6 +71,8 @@ def run_stream(
         resumed: The map to go on with; of the same configuration and seed.
         checkpoint_every: Number of updates after which the map is written again.
         stop: Is asked before each frame, and ends the mapping by returning something true.
+        tracker: Refines the poses, and writes the trajectory. Such a run cannot be resumed: the
+            file of the map has no poses.
 
     Returns:
         The contents of `metrics.json`.
@@ -88,7 +92,10 @@ def run_stream(
     def keep(state: MapState, progress: Progress) -> None:
         try:
             map_path.parent.mkdir(parents=True, exist_ok=True)
-            save_map(map_path, SavedMap(state, progress, seed, truth is None))
+            if tracker is None:
+                save_map(map_path, SavedMap(state, progress, seed, truth is None))
+            else:
+                checkpoint.save(map_path, state)
             lost.clear()
         except OSError as error:  # no reason to lose the map in memory, or the scores and pictures
             lost[:] = [error]
@@ -105,6 +112,7 @@ def run_stream(
         keep=keep,
         keep_every=checkpoint_every,
         stop=stop,
+        tracker=tracker,
     )
     if save_path is not None or mapped.stopped is not None:
         keep(mapped.state, mapped.progress)
@@ -122,6 +130,9 @@ def run_stream(
         up_world = drawing.draw_map(folder, queries, exact_sdf, mapped.path_world, mapped.up_world)
         described = report.describe(mapped, config) | {"stream": name, "seed": seed} | scores
         described["up_world"] = up_world.tolist()
+        if tracker is not None:
+            described |= tracker.counts()
+            tracker.write(folder, up_world)
         described["total_s"] = time.perf_counter() - start
         report.write_json(folder / "metrics.json", described)
     print(report.summarize(described))

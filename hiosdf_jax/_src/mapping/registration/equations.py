@@ -21,9 +21,12 @@ INLIER_DEVIATIONS = 3.0
 # No patch is known better than this, m.
 _LEAST_SIGMA_M = 0.005
 
-# Returns this deep in unseen space are compared, m, and this many coarse scales.
+# Returns this deep in unseen space are compared, m, and this many times what a coarse scale has
+# above the other length, m. Smaller scales track a sensor in a map that still grows: there, a
+# return in unseen space is of a surface that the map does not have.
 _DEEPEST_M = 0.1
 _DEEPEST_SCALES = 2.0
+_TRACKING_M = 0.2
 
 # A direction is free if the returns fit about as well where they are moved this far along it, m: if
 # their mean loss, which is at most 1, grows by less than this. Its slope alone does not tell: noise
@@ -70,6 +73,7 @@ class Residuals(NamedTuple):
         jacobian: Their derivative by the motion, (N, 6).
         sigma: Standard deviation of each, (N,) m.
         comparable: The map has observed the place, (N,) bool.
+        contrary: The map has seen it empty, (N,) bool.
         weight: Inverse variance, less for outliers, 0 where nothing can be compared, (N,).
         points_world: (N, 3) m.
     """
@@ -78,6 +82,7 @@ class Residuals(NamedTuple):
     jacobian: jax.Array
     sigma: jax.Array
     comparable: jax.Array
+    contrary: jax.Array
     weight: jax.Array
     points_world: jax.Array
 
@@ -155,14 +160,15 @@ def compare(
     across = jnp.sum(match.normal * offset, axis=-1) ** 2 / square
     variance = across * rows.sigma**2 + match.spread**2 + _LEAST_SIGMA_M**2
     comparable = rows.some & match.usable
-    comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * scale_m)
+    comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - _TRACKING_M))
     sigma = jnp.sqrt(variance + (scale_m / INLIER_DEVIATIONS) ** 2)
     # The function of Geman and McClure.
     ratio = match.distance / (INLIER_DEVIATIONS * sigma)
     weight = jnp.where(comparable, 1 / (sigma * (1 + ratio**2)) ** 2, 0)
     turn = jnp.cross(offset, match.normal) / rows.length
     jacobian = jnp.concatenate([match.normal, turn], axis=-1)
-    return Residuals(match.distance, jacobian, sigma, comparable, weight, points_world)
+    contrary = rows.some & match.empty
+    return Residuals(match.distance, jacobian, sigma, comparable, contrary, weight, points_world)
 
 
 def information_of(residuals: Residuals) -> jax.Array:

@@ -15,6 +15,15 @@ from hiosdf_jax._src.state import Baked, Field
 # A gradient that is shorter than this lies between surfaces and has no direction.
 _LEAST_SLOPE = 0.5
 
+# Points farther from a patch along its plane are beside the surface that is known so far. They
+# would pull a cloud back to where the map ends. Narrower patches show no normal.
+_MOST_BESIDE_VOXELS = 0.8
+_LEAST_WIDTH_VOXELS = 0.1
+
+# A return contradicts the map if it is this far inside observed space, and this far from patches.
+_FREE_VOXELS = 0.5
+_EMPTY_VOXELS = 1.5
+
 # The error of trilinear interpolation near surfaces, as a share of the samples' spacing.
 _BAKED_SPREAD = 0.05
 
@@ -23,11 +32,12 @@ class Match(NamedTuple):
     """Points compared with a map.
 
     Attributes:
-        distance: Signed distance from the surface, (N,) m.
+        distance: Signed distance from the surface, or from its plane, (N,) m.
         normal: Its gradient, (N, 3).
         spread: Standard deviation of the surface there, (N,) m.
         depth: How far the point lies in unseen space, (N,) m; negative in observed space.
         usable: The map has a surface near the point, (N,) bool.
+        empty: The map has seen the place, and no surface there, (N,) bool.
     """
 
     distance: jax.Array
@@ -35,6 +45,7 @@ class Match(NamedTuple):
     spread: jax.Array
     depth: jax.Array
     usable: jax.Array
+    empty: jax.Array
 
 
 def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
@@ -56,20 +67,19 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
         # `bake` takes half a cell's diagonal off the frontier.
         depth = depth - 3**0.5 / 2 * field.resolution
         inside = jnp.ones(distance.shape, bool)
+        empty = jnp.zeros(distance.shape, bool)  # all points are usable
     else:
         config, surface = field.config, field.surface
-
-        def nearest(points: jax.Array) -> tuple[jax.Array, jax.Array]:
-            found = lookup.nearest_patch(config, surface, points)
-            return found.sdf, found.spread
-
-        distance, pull, spread = jax.vjp(nearest, points_world, has_aux=True)
-        (normal,) = pull(jnp.ones_like(distance))
+        plane = lookup.nearest_plane(config, surface, points_world)
+        distance, normal, spread = plane.height, plane.normal, plane.spread
         depth = -lookup.frontier_distance(config, surface, geometry.clamp(config, points_world))
         inside = jnp.all(points_world == geometry.clamp(config, points_world), axis=-1)
-        inside &= jnp.abs(distance) < 0.99 * config.distance_horizon
+        free = depth < -_FREE_VOXELS * config.voxel_size
+        empty = inside & free & (plane.away > _EMPTY_VOXELS * config.voxel_size)
+        inside &= plane.beside < _MOST_BESIDE_VOXELS * config.voxel_size
+        inside &= plane.width > _LEAST_WIDTH_VOXELS * config.voxel_size
     steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
-    return Match(distance, normal, spread, depth, inside & steep)
+    return Match(distance, normal, spread, depth, inside & steep, empty)
 
 
 def noise_of(field: Field | Baked) -> tuple[float, float]:

@@ -24,13 +24,16 @@ from hiosdf_jax._src.mapping.registration.motion import move
 from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.state import Baked, Field
 
-# Surfaces may be this far from where they should be in the first and in the last coarse step, m.
-# Smaller first scales lose poses that are 15 cm and 6 degrees off; fewer steps do not suffice
-# along directions in which few returns tell anything.
-_COARSE_M = (0.7, 0.03)
+# Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
+# suffice along directions in which few returns tell anything.
+_COARSE_END_M = 0.03
 _COARSE_STEPS = 24
 _COARSE_ROWS = 1024
 _DAMPING = 1e-5
+
+# So many returns tell as much as one independent one. Against a prior, coarse steps must not trust
+# them more: their noisy normals tell of directions of which the surfaces tell nothing.
+_COARSE_INFLATION = 16.0
 
 _FINE_STEPS = 24
 _WHOLE_STEPS = 8  # half steps then: the distance has kinks, around which whole ones may jump
@@ -45,7 +48,9 @@ def take_evenly(rows: Rows) -> Rows:
     return take_rows(rows, slice(None, None, every))
 
 
-def solve_coarse(field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anchor) -> jax.Array:
+def solve_coarse(
+    field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anchor, reach_m: jax.Array | float
+) -> jax.Array:
     """Brings a pose near the solution, with a tolerance that shrinks from step to step.
 
     Args:
@@ -53,19 +58,21 @@ def solve_coarse(field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anch
         rows: The returns.
         pose: (4, 4), where to begin.
         anchor: What holds free directions.
+        reach_m: How far surfaces may be from where they should be in the first step.
 
     Returns:
         (4, 4).
     """
     few = take_evenly(rows)
-    first, last = _COARSE_M
+    shrink = _COARSE_END_M / reach_m
     # Fine steps bring free directions back.
     axes = no_free_directions()
 
     def step(i: jax.Array, pose: jax.Array) -> jax.Array:
-        scale_m = first * (last / first) ** (i / (_COARSE_STEPS - 1))
+        scale_m = reach_m * shrink ** (i / (_COARSE_STEPS - 1))
         residuals = compare(field, few, pose, scale_m)
-        return move(pose, find_step(residuals, axes, anchor, few, pose, damping=_DAMPING))
+        motion = find_step(residuals, axes, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
+        return move(pose, motion)
 
     return jax.lax.fori_loop(0, _COARSE_STEPS, step, pose)
 
