@@ -32,7 +32,7 @@ class Match(NamedTuple):
     """Points compared with a map.
 
     Attributes:
-        distance: Signed distance from the surface, or from its plane, (N,) m.
+        distance: Signed distance from the surface, (N,) m.
         normal: Its gradient, (N, 3).
         spread: Standard deviation of the surface there, (N,) m.
         depth: How far the point lies in unseen space, (N,) m; negative in observed space.
@@ -70,8 +70,14 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
         empty = jnp.zeros(distance.shape, bool)  # all points are usable
     else:
         config, surface = field.config, field.surface
+
+        def nearest(points: jax.Array) -> tuple[jax.Array, jax.Array]:
+            found = lookup.nearest_patch(config, surface, points)
+            return found.sdf, found.spread
+
+        distance, pull, spread = jax.vjp(nearest, points_world, has_aux=True)
+        (normal,) = pull(jnp.ones_like(distance))
         plane = lookup.nearest_plane(config, surface, points_world)
-        distance, normal, spread = plane.height, plane.normal, plane.spread
         depth = -lookup.frontier_distance(config, surface, geometry.clamp(config, points_world))
         inside = jnp.all(points_world == geometry.clamp(config, points_world), axis=-1)
         free = depth < -_FREE_VOXELS * config.voxel_size

@@ -21,6 +21,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import (
+    FINE_START_M,
     differentiable,
     select_rows,
     solve_coarse,
@@ -149,13 +150,13 @@ def _refine(
     near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held, reach_m)
     index, directions = select_rows(still, frozen, near)
     chosen = take_rows(frozen, index)
-    found, finished = solve_fine(still, chosen, near, directions, held, 1.0)
+    found, finished = solve_fine(still, chosen, near, directions, held, 1.0, FINE_START_M)
     inflation = jnp.float32(1)
     if prior is not None:
         # The prior counts by its covariance, so returns must not count as independent of each
         # other.
         inflation = inflation_of(compare(still, chosen, found, 0.0), directions)
-        found, finished = solve_fine(still, chosen, found, directions, held, inflation)
+        found, finished = solve_fine(still, chosen, found, directions, held, inflation, 0.0)
     covariance = covariance_of(compare(still, chosen, found, 0.0), directions, held, rows)
 
     even = take_evenly(frozen)

@@ -35,8 +35,16 @@ _DAMPING = 1e-5
 # them more: their noisy normals tell of directions of which the surfaces tell nothing.
 _COARSE_INFLATION = 16.0
 
+# Rows are selected where surfaces may be this far off, m: those that contradict a pose that is not
+# yet right must be among them. Fine steps begin with a smaller tolerance, m, and shrink it by a
+# factor in each step.
+_SELECTED_M = 0.1
+FINE_START_M = 0.06
+_FINE_SHRINK = 0.7
+_FINE_END_M = 0.004  # no tolerance below
+
 _FINE_STEPS = 24
-_WHOLE_STEPS = 8  # half steps then: the distance has kinks, around which whole ones may jump
+_WHOLE_STEPS = 16  # half steps then: the distance has kinks, around which whole ones may jump
 _FINE_ROWS = 2048
 _FINISHED_M = 5e-6
 _RESTING_M = 2e-3
@@ -92,7 +100,7 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
     directions = find_directions(field, take_evenly(rows), pose)
     if rows.points.shape[0] <= _FINE_ROWS:
         return jnp.arange(rows.points.shape[0]), directions
-    residuals = compare(field, rows, pose, 0.0)
+    residuals = compare(field, rows, pose, _SELECTED_M)
     information = information_of(residuals)
     # Free directions must not draw all rows.
     held = jnp.where(directions.free, jnp.trace(information), 0)
@@ -109,6 +117,7 @@ def solve_fine(
     directions: Directions,
     anchor: Anchor,
     inflation: jax.Array | float,
+    start_m: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Steps until the pose stays where it is.
 
@@ -119,14 +128,19 @@ def solve_fine(
         directions: Principal directions, some of them free.
         anchor: What holds free directions.
         inflation: How many returns tell as much as one independent one would.
+        start_m: How far surfaces may be from where they should be in the first step.
 
     Returns:
         The pose (4, 4), and whether the last step was short, () bool.
     """
 
+    def tolerance(count: jax.Array) -> jax.Array:
+        scale_m = start_m * _FINE_SHRINK**count
+        return jnp.where(scale_m > _FINE_END_M, scale_m, 0)
+
     def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
         pose, _, count = carry
-        residuals = compare(field, rows, pose, 0.0)
+        residuals = compare(field, rows, pose, tolerance(count))
         motion = find_step(residuals, directions, anchor, rows, pose, inflation)
         way = jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
         motion = jnp.where(count < _WHOLE_STEPS, 1, 0.5) * motion
@@ -134,7 +148,8 @@ def solve_fine(
 
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         _, way, count = carry
-        return (count < _FINE_STEPS) & ~(way <= _FINISHED_M)
+        rests = (way <= _FINISHED_M) & (tolerance(count) == 0)
+        return (count < _FINE_STEPS) & ~rests
 
     start = (pose, jnp.float32(jnp.inf), jnp.int32(0))
     pose, way, _ = jax.lax.while_loop(goes_on, step, start)
