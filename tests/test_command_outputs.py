@@ -90,6 +90,12 @@ def case(tmp_path, kind):
         return [*map_, "--save", str(save)], f"--save {save} would replace a file that is no map"
     if kind == "save below a file":
         return [*map_, "--save", f"{stream}/map.npz"], f"{stream}/map.npz: Not a directory"
+    if kind == "save onto a long name":
+        save = tmp_path / f"{'x' * 256}.npz"
+        return [*map_, "--save", str(save)], f"{save}: File name too long"
+    if kind == "output into a long name":
+        folder = tmp_path / ("x" * 256)
+        return [*map_, "--output", str(folder)], f"{folder}: File name too long"
     if kind == "output is a file":
         return [*map_, "--output", str(stream)], f"{stream}: File exists"
     if kind == "output below a file":
@@ -126,6 +132,8 @@ def case(tmp_path, kind):
         "save onto a folder",
         "save onto a read-only file",
         "save onto a device",
+        "save onto a long name",
+        "output into a long name",
         "save onto the stream",
         "save onto a result",
         "save onto a file that is no map",

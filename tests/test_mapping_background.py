@@ -11,7 +11,7 @@ import pytest
 from room import arrays_equal, stream
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping import background
+from hiosdf_jax._src.mapping.background import fusing
 
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)).astype(np.float32)
 
@@ -45,7 +45,7 @@ def test_the_newest_frame_replaces_the_waiting_one(empty_map, monkeypatch):
         assert go.wait(10)
         return state
 
-    monkeypatch.setattr(background, "update", slow)
+    monkeypatch.setattr(fusing, "update", slow)
     mapper = hio.BackgroundMapper(empty_map)
     pose = np.eye(4)
     mapper.put(np.zeros((1, 3)), pose)
@@ -127,7 +127,7 @@ def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch)
     def broken(*_, **__):
         raise OSError("no device")
 
-    monkeypatch.setattr(background, "update", broken)
+    monkeypatch.setattr(fusing, "update", broken)
     mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
@@ -158,7 +158,9 @@ def test_a_frame_of_a_wrong_type_is_counted_and_mapping_continues(empty_map, clo
     assert int(mapper.field.updates) == 1
 
 
-@pytest.mark.parametrize("stamp", [None, "soon", "1.5", np.nan, np.inf, 10**400, 1e39, 1.7e9, 1j])
+@pytest.mark.parametrize(
+    "stamp", [None, "soon", "1.5", True, np.nan, np.inf, 10**400, 1e39, 1.7e9, 1j]
+)
 def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
     with hio.BackgroundMapper(empty_map) as mapper:
         with pytest.raises(ValueError, match=r"stamp is .*, expected a finite number of seconds"):
@@ -166,9 +168,19 @@ def test_a_bad_stamp_is_refused_by_put(empty_map, stamp):
         assert mapper.wait() is empty_map
 
 
-def test_a_mapper_takes_maps_only(empty_map):
+def test_wrong_arguments_are_named(empty_map):
     with pytest.raises(ValueError, match="state is Field, expected a MapState"):
         hio.BackgroundMapper(hio.snapshot(empty_map))
+    with pytest.raises(ValueError, match="serve is 5, expected a function"):
+        hio.BackgroundMapper(empty_map, serve=5)
+    with hio.BackgroundMapper(empty_map) as mapper:
+        for call in (mapper.wait, mapper.close):
+            for timeout in ("x", np.nan, np.inf, True):
+                with pytest.raises(ValueError, match=r"timeout_s is .*, expected a finite number"):
+                    call(timeout)
+        with pytest.raises(ValueError, match="serve is 'bake'"):
+            mapper.serve = "bake"
+        assert mapper.wait(1e300) is empty_map
 
 
 BAD_FRAMES = {
@@ -237,7 +249,7 @@ def test_an_exception_of_the_controller_is_kept(empty_map, monkeypatch):
     def broken(*_, **__):
         raise OSError("no device")
 
-    monkeypatch.setattr(background, "update", broken)
+    monkeypatch.setattr(fusing, "update", broken)
     with pytest.raises(KeyError, match="goal"), hio.BackgroundMapper(empty_map) as mapper:
         mapper.put(*stream(1)[0])
         raise KeyError("goal")
@@ -249,7 +261,7 @@ def test_a_failure_can_be_read_without_an_exception(empty_map, monkeypatch):
     def broken(*_, **__):
         raise OSError("no device")
 
-    monkeypatch.setattr(background, "update", broken)
+    monkeypatch.setattr(fusing, "update", broken)
     mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
@@ -266,7 +278,7 @@ def test_closing_and_waiting_end_while_a_frame_takes_forever(empty_map, monkeypa
         assert go.wait(30)
         return state
 
-    monkeypatch.setattr(background, "update", endless)
+    monkeypatch.setattr(fusing, "update", endless)
     mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     for call in (mapper.wait, mapper.close):
@@ -287,7 +299,7 @@ import sys, time
 import jax, jax.numpy as jnp
 import hiosdf_jax as hio
 from room import CONFIG
-from hiosdf_jax._src.mapping import background
+from hiosdf_jax._src.mapping.background import fusing
 
 @jax.jit
 def work(x):
@@ -298,7 +310,7 @@ def update(state, cloud, pose, **_):
         jax.block_until_ready(work(jnp.ones((200, 200))))
     return state
 
-background.update = update
+fusing.update = update
 mapper = hio.BackgroundMapper(hio.init(CONFIG, jax.random.key(0)))
 for _ in range(3):
     mapper.put(jnp.ones((5, 3)), jnp.eye(4))

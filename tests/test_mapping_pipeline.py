@@ -257,6 +257,11 @@ def test_init_and_queries_name_wrong_arguments(room_map):
         hio.query(3, np.zeros(3))
     with pytest.raises(ValueError, match="state is int"):
         hio.save("nowhere", 3)
+    for stamp in (np.nan, jnp.float32(np.nan), jnp.inf, jnp.zeros(2), True, "now"):
+        with pytest.raises(ValueError, match="stamp"):
+            hio.snapshot(room_map, stamp)
+    assert float(jax.jit(hio.snapshot)(room_map, 1.5).stamp) == 1.5
+    assert float(jax.jit(lambda state: hio.snapshot(state, 1.5))(room_map).stamp) == 1.5
     old_style = hio.init(CONFIG, jax.random.PRNGKey(0))
     assert arrays_equal(old_style, hio.init(CONFIG, jax.random.key(0)))
 

@@ -7,7 +7,7 @@ import pytest
 from plain_siren import BOUNDS, numpy_forward, numpy_gradient
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.network import hopper, siren
+from hiosdf_jax._src.network import evaluation, siren
 
 mosaic = pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
 
@@ -30,10 +30,10 @@ def interpreted(monkeypatch):
     """Runs the kernel on the CPU, on one multiprocessor, for any number of rows."""
     if not hasattr(mosaic, "InterpretGPUParams"):
         pytest.skip("this jax cannot interpret GPU kernels")
-    monkeypatch.setattr(hopper, "is_available", lambda: True)
-    monkeypatch.setattr(hopper, "_INTERPRET", mosaic.InterpretGPUParams())
-    monkeypatch.setattr(hopper, "_LEAST_ROWS", 1)
-    monkeypatch.setattr(hopper, "_multiprocessors", lambda: 1)
+    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(evaluation, "_INTERPRET", mosaic.InterpretGPUParams())
+    monkeypatch.setattr(evaluation, "_LEAST_ROWS", 1)
+    monkeypatch.setattr(evaluation, "_multiprocessors", lambda: 1)
 
 
 @pytest.mark.parametrize(("width", "layers", "rows"), [(128, 4, 200), (128, 1, 100), (256, 2, 65)])
@@ -76,18 +76,18 @@ def test_the_device_is_chosen_when_the_program_is_compiled(monkeypatch):
         traced = program.trace(params, jax.ShapeDtypeStruct((8192, 3), jnp.float32))
         return "mosaic_gpu" in traced.lower(lowering_platforms=(platform,)).as_text()
 
-    monkeypatch.setattr(hopper, "_LEAST_ROWS", 1)  # on a CPU, points come in tiles
-    assert not hopper.is_available()
+    monkeypatch.setattr(evaluation, "_LEAST_ROWS", 1)  # on a CPU, points come in tiles
+    assert not evaluation.is_available()
     assert not has_kernel("cuda")
-    monkeypatch.setattr(hopper, "is_available", lambda: True)
+    monkeypatch.setattr(evaluation, "is_available", lambda: True)
     assert has_kernel("cuda")
     assert not has_kernel("cpu")
 
 
 @pytest.mark.parametrize(("width", "layers"), [(100, 2), (512, 4), (128, 9)])
 def test_other_networks_are_left_to_xla(monkeypatch, width, layers):
-    monkeypatch.setattr(hopper, "_LEAST_ROWS", 1)
-    monkeypatch.setattr(hopper, "is_available", lambda: True)
+    monkeypatch.setattr(evaluation, "_LEAST_ROWS", 1)
+    monkeypatch.setattr(evaluation, "is_available", lambda: True)
     config, params = network(width, layers)
     program = jax.jit(lambda p, x: siren.predict(config, p, x))
     shape = jax.ShapeDtypeStruct((8192, 3), jnp.float32)
@@ -96,7 +96,7 @@ def test_other_networks_are_left_to_xla(monkeypatch, width, layers):
 
 
 def test_few_points_are_left_to_xla(monkeypatch):
-    monkeypatch.setattr(hopper, "is_available", lambda: True)
+    monkeypatch.setattr(evaluation, "is_available", lambda: True)
     config, params = network(128, 1)
     program = jax.jit(lambda p, x: siren.predict(config, p, x))
     shape = jax.ShapeDtypeStruct((100, 3), jnp.float32)
@@ -112,12 +112,12 @@ def test_an_untried_jax_is_left_to_xla(monkeypatch):
 
     monkeypatch.setattr(jax, "devices", lambda: [Hopper()])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert hopper.is_available() == (jax.__version_info__ < (0, 13))
+    assert evaluation.is_available() == (jax.__version_info__ < (0, 13))
     monkeypatch.setattr(jax, "__version_info__", (0, 13, 0))
-    assert not hopper.is_available()
+    assert not evaluation.is_available()
     monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
     monkeypatch.setattr(Hopper, "compute_capability", "8.0")
-    assert not hopper.is_available()
+    assert not evaluation.is_available()
     monkeypatch.setattr(Hopper, "compute_capability", "9.0")
     monkeypatch.setattr(jax, "devices", lambda: [Hopper(), Hopper()])
-    assert not hopper.is_available()
+    assert not evaluation.is_available()

@@ -41,6 +41,27 @@ def test_the_paper_s_network():
     np.testing.assert_allclose(gradient, numpy_gradient(config, params, points), atol=2e-4)
 
 
+def test_vmap_over_points_takes_the_memory_of_a_batch():
+    """A planner is written for one point, and batched by `jax.vmap`."""
+    params = siren.init_params(TINY, jax.random.key(0))
+    points = np.random.default_rng(3).uniform(-1, 1, (40_000, 3)).astype(np.float32)
+
+    def of_point(params, point):
+        return jax.value_and_grad(lambda x: siren.predict(TINY, params, x))(point)
+
+    def of_rows(params, points):
+        return siren.predict_with_gradient(TINY, params, points)
+
+    nested = jax.vmap(jax.vmap(of_point, (None, 0)), (None, 0))
+    single = jax.jit(jax.vmap(of_point, (None, 0))).lower(params, points).compile()
+    tiled = jax.jit(nested).lower(params, points.reshape(40, 1000, 3)).compile()
+    batch = jax.jit(of_rows).lower(params, points).compile()
+    assert np.abs(single(params, points)[1] - batch(params, points)[1]).max() < 1e-4
+    most = 1.05 * batch.memory_analysis().temp_size_in_bytes
+    assert single.memory_analysis().temp_size_in_bytes <= most
+    assert tiled.memory_analysis().temp_size_in_bytes <= most
+
+
 @pytest.mark.parametrize("rows", [32_769, 40_000])
 def test_eager_equals_jit_equals_vmap(rows):
     params = siren.init_params(TINY, jax.random.key(0))

@@ -112,14 +112,13 @@ SPHERES = planning.RobotSpheres(
 
 
 def call_update(state, draw):
-    extras = {}
-    if draw(st.booleans()):
-        extras["robot"] = draw(
-            st.sampled_from([None, 5, "ab", (1, 2, 3), {"a": 1, "b": 2}])
-            | st.tuples(argument([[0.5, 0, 0]]), argument([0.1]))
-        )
-    if draw(st.booleans()):
-        extras["noise"] = draw(argument([0.01, 0.001]))
+    # As many spheres as in test_mapping_robot_and_noise.py: one compilation.
+    robot = st.sampled_from([None, 5, "ab", (1, 2, 3), {"a": 1, "b": 2}]) | st.tuples(
+        argument([[0.5, 0, 0], [0, 0.5, 0]]), argument([0.1, 0.1])
+    )
+    noise = argument([0.01, 0.001])
+    name, values = draw(st.sampled_from([("robot", robot), ("noise", noise), ("", None)]))
+    extras = {name: draw(values)} if name else {}
     cloud, pose = draw(argument(CLOUD)), draw(argument(POSE))
     if draw(st.booleans()):
         return hio.moving_rows(state, cloud, pose, **extras)

@@ -109,7 +109,7 @@ def refusals(tmp_path):
         (loop, OSError, "not a regular file"),
         (tmp_path / "pipe", OSError, "not a regular file"),
         (Path("/dev/null"), OSError, "not a regular file"),
-        (tmp_path / ("long" * 60), OSError, "File name too long"),
+        (tmp_path / ("long" * 64), OSError, "File name too long"),
     ]
 
 
@@ -218,7 +218,7 @@ def test_abandoned_files_are_removed_and_those_of_living_writers_kept(tmp_path):
 KILLED = """
 import sys
 from hiosdf_jax._src.output_files import replacing, replacing_together
-if sys.argv[1] == "one":
+if sys.argv[1] != "together":
     with replacing(sys.argv[2]) as file:
         file.write(bytes(1000))
         print("writing", flush=True)
@@ -230,15 +230,40 @@ with replacing_together(sys.argv[2], ["a"]) as folder:
 """
 
 
-@pytest.mark.parametrize("kind", ["one", "together"])
+LONGEST = "maß" * 63 + "x" * 3  # 255 bytes: the most that a file system takes
+
+
+@pytest.mark.parametrize("name", [LONGEST, "x" * 101, "x" * 220])
+def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, name):
+    path = tmp_path / name
+    check_output(path)
+    with replacing(path) as file:
+        file.write(NEW)
+        (part,) = listing(tmp_path)
+        assert len(os.fsencode(part)) < 140
+        write(tmp_path / f"{name[:-1]}y", OLD)  # another file's: this one stays
+        assert part in listing(tmp_path)
+    assert path.read_bytes() == NEW and len(listing(tmp_path)) == 2
+
+
+def test_a_name_that_is_too_long_is_refused(tmp_path):
+    path = tmp_path / f"{LONGEST}x"
+    for check in (check_output, write, lambda path: check_output_folder(path, NAMES)):
+        with pytest.raises(OSError) as caught:
+            check(path)
+        assert (caught.value.errno, caught.value.filename) == (errno.ENAMETOOLONG, str(path))
+    assert listing(tmp_path) == []
+
+
+@pytest.mark.parametrize("kind", ["one", "long", "together"])
 def test_a_killed_writer_leaves_what_the_next_one_removes(tmp_path, kind):
-    path = tmp_path / "file" if kind == "one" else tmp_path
+    path = tmp_path / {"one": "file", "long": LONGEST, "together": ""}[kind]
     arguments = [sys.executable, "-c", KILLED, kind, str(path)]
     with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
         assert writer.stdout.readline() == b"writing\n"
         (part,) = listing(tmp_path)
         assert part.endswith(".part")
-        replace = write if kind == "one" else write_together
+        replace = write_together if kind == "together" else write
         replace(path)  # while it lives
         assert part in listing(tmp_path)
         writer.kill()

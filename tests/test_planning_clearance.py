@@ -239,6 +239,8 @@ def test_collision_cost_equals_chomps():
         ({"end_world": np.zeros((2, 3))}, r"end_world has shape \(2, 3\)"),
         ({"evaluations": 1}, "evaluations is 1"),
         ({"evaluations": 2.5}, "evaluations is 2.5"),
+        ({"evaluations": 10**12}, "evaluations is 1000000000000, expected at most 10000"),
+        ({"evaluations": 10**30}, "evaluations is 1000"),
         ({"slope": 0.0}, "slope is 0.0"),
         ({"slope": float("nan")}, "slope is nan"),
         ({"unknown": "free"}, "unknown is 'free'"),
@@ -261,3 +263,6 @@ def test_bad_arguments_of_clearances_and_costs_are_refused(scene):
     for margin in (0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="margin_m"):
             planning.collision_cost(0.1, margin)
+    for cost in (planning.collision_cost, jax.jit(planning.collision_cost)):
+        with pytest.raises(ValueError, match=r"margin_m has shape \(4,\), .* \(3,\)"):
+            cost(np.zeros(3), np.ones(4))

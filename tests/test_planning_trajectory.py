@@ -132,3 +132,33 @@ def test_bad_arguments_are_refused():
         optimize_trajectory(field, np.zeros((4, 3)), radius_m=-1)
     with pytest.raises(ValueError, match="margin_m is nan"):
         optimize_trajectory(field, np.zeros((4, 3)), radius_m=0.1, margin_m=np.nan)
+    with pytest.raises(ValueError, match="steps is 1000000000000, expected at most"):
+        optimize_trajectory(field, np.zeros((4, 3)), radius_m=0.1, steps=10**12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"key": 5}, "key has dtype int32"),
+        ({"key": "seed"}, "key is str"),
+        ({"key": jax.random.split(jax.random.key(0))}, r"key has dtype .* shape \(2,\)"),
+        ({"start_world": np.zeros(2)}, r"start_world has shape \(2,\)"),
+        ({"goal_world": "there"}, "goal_world"),
+        ({"count": 10**12}, "count is 1000000000000, expected at most"),
+        ({"count": 10**6, "waypoints": 10**4}, "count is 1000000 and waypoints is 10000"),
+        ({"spread_m": -1.0}, "spread_m is -1"),
+    ],
+)
+def test_bad_arguments_of_waves_are_refused(arguments, words):
+    good = {
+        "key": jax.random.key(0),
+        "start_world": np.zeros(3),
+        "goal_world": np.ones(3),
+        "count": 2,
+        "waypoints": 4,
+        "spread_m": 0.1,
+    }
+    assert waves(**good).shape == (2, 4, 3)
+    assert waves(**good | {"key": jax.random.PRNGKey(0)}).shape == (2, 4, 3)
+    with pytest.raises(ValueError, match=words):
+        waves(**good | arguments)

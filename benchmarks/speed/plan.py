@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from benchmarks.speed import limits, networks, processes, queries, scaling, stages, updates
+import hiosdf_jax as hio
+from benchmarks.speed import fleets, limits, networks, processes, queries, scaling, stages, updates
 from benchmarks.speed.rows import Measured
 from benchmarks.speed.setup import Setup
 from hiosdf_jax._src.state import MapState
@@ -68,6 +69,10 @@ def plan(setup: Setup) -> dict[str, Task]:
     )
     queried = "default" if "default" in sizes.configs else last
     tasks["queries"] = lambda: queries.query_map(queried, state(queried), machine(), sizes)
+    tasks["points one by one"] = lambda: queries.query_points_one_by_one(
+        queried, hio.snapshot(state(queried)), sizes
+    )
+    tasks["fleet"] = lambda: fleets.maps_at_once(sizes.fleet, seconds)
     tasks["compiling by sizes"] = lambda: scaling.compile_updates(setup, last)
     tasks["donated updates"] = lambda: updates.donated_updates(setup, last)
     tasks["cloud sizes"] = lambda: scaling.cloud_sizes(setup)

@@ -1,13 +1,17 @@
-"""Task that times distances and gradients by each variant of a map."""
+"""Tasks that time distances and gradients by each variant of a map."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
 
 import hiosdf_jax as hio
 from benchmarks.speed import limits
 from benchmarks.speed.networks import points_in
-from benchmarks.speed.rows import Measured, Row, Spread, time_ms
+from benchmarks.speed.rows import Baseline, Measured, Row, Spread, time_ms
 from benchmarks.speed.setup import Sizes
 from benchmarks.variants import VARIANTS
 from hiosdf_jax._src.state import MapState
@@ -45,3 +49,41 @@ def query_map(label: str, state: MapState, machine: limits.Limits, sizes: Sizes)
         add("baked", count, time(hio.sdf_and_grad, baked, points_in(config, count)))
     samples = f"{baked.sdf.size:,} samples of {sizes.bake_resolution} m"
     return Measured([*rows, Row(f"bake, {label}", "ms", baking, note=samples)])
+
+
+def query_points_one_by_one(label: str, field: hio.Field, sizes: Sizes) -> Measured:
+    """Times functions of one point under `jax.vmap` beside the same points as one batch.
+
+    Args:
+        label: Name of the configuration.
+        field: A snapshot of a map.
+        sizes: Points per query, and how long to time each.
+
+    Returns:
+        Rows in ms, with the peak of the temporary memory as a note, and the batches as baselines.
+    """
+    rows, baselines = [], {}
+    functions = {
+        "sdf": (hio.sdf, hio.sdf),
+        "value_and_grad(sdf)": (jax.value_and_grad(hio.sdf, argnums=1), hio.sdf_and_grad),
+    }
+    for count in dict.fromkeys((sizes.queries, sizes.baked_queries)):
+        points = points_in(field.config, count)
+        for name, (one_point, batch) in functions.items():
+            full = f"vmap({name}) of {count:,}, {label}"
+            vmapped = jax.vmap(one_point, in_axes=(None, 0))
+            spread, note = _time_with_memory(vmapped, field, points, sizes.seconds)
+            beside, beside_note = _time_with_memory(batch, field, points, sizes.seconds)
+            rows.append(Row(full, "ms", spread, full, note=note))
+            baselines[full] = [Baseline(f"one batch, {beside_note}", beside)]
+    return Measured(rows, baselines)
+
+
+def _time_with_memory(
+    function: Callable[..., Any], field: hio.Field, points: jax.Array, seconds: float
+) -> tuple[Spread, str]:
+    """Times a compiled function; the note is the memory of its temporary arrays."""
+    compiled = jax.jit(function).lower(field, points).compile()
+    analysis = compiled.memory_analysis()
+    note = f"{1e-6 * analysis.temp_size_in_bytes:.0f} MB" if analysis else "memory unknown"
+    return time_ms(compiled, field, points, seconds=seconds), note

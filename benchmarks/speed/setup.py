@@ -43,6 +43,7 @@ class Sizes:
         queries: Points per query.
         baked_queries: Points per query of the baked field alone.
         bake_resolution: m.
+        fleet: Small maps at once.
         cloud_sizes: Points per cloud.
         map_edges: Edges of square maps as high as the stream's bounds, m.
         endurance: Updates in a row.
@@ -60,6 +61,7 @@ class Sizes:
     queries: int
     baked_queries: int
     bake_resolution: float
+    fleet: int
     cloud_sizes: tuple[int, ...]
     map_edges: tuple[float, ...]
     endurance: int
@@ -78,6 +80,7 @@ FULL = Sizes(
     queries=102_400,
     baked_queries=1_048_576,
     bake_resolution=0.05,
+    fleet=1024,
     cloud_sizes=(1_000, 16_000, 77_000, 300_000),
     map_edges=(10.0, 20.0, 60.0),
     endurance=10_000,
@@ -96,6 +99,7 @@ QUICK = Sizes(
     queries=102_400,
     baked_queries=102_400,
     bake_resolution=0.2,
+    fleet=8,
     cloud_sizes=(16_000, 77_000),
     map_edges=(10.0, 20.0),
     endurance=100,

@@ -91,17 +91,6 @@ def ablation() -> str:
     return lay_out(["`Config.light`, 20 LiDAR frames", *columns], rows)
 
 
-def slopes() -> str:
-    """Errors of `Config.paper` with the slopes of all samples, and of half of them."""
-    rows = []
-    for label, config in (("all samples", "paper"), ("half of them", "paper, eikonal_every=2")):
-        means = [_figures(stream, config)["mean"]["blended"] for stream in (*_HOUSE, *_REAL)]
-        metrics = ("visible_cm", "visible_cm", "median_cm", "median_cm")
-        rows.append([label, *map(_score, means, metrics)])
-    columns = [f"house, {sensor}" for sensor in _HOUSE.values()] + list(_REAL.values())
-    return lay_out(["Eikonal loss on", *columns], rows)
-
-
 def mesh() -> str:
     """The mesh of the house, ours beside Open3D's."""
     names = [f"Open3D TSDF {edge} cm" for edge in (10, 5, 2)]
@@ -148,7 +137,6 @@ TABLES = {
     "accuracy-spread": spread,
     "real": real,
     "ablation": ablation,
-    "slopes": slopes,
     "mesh": mesh,
     "steps": steps,
     "training": training,

@@ -4,28 +4,24 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from benchmarks import records
 from benchmarks.speed.rows import format_number
 from benchmarks.tables.markdown import lay_out
 from hiosdf_jax._src.mapping.stages import STAGES
 
-_HALF = "slopes of 1 in 2"
 _QUERY = "sdf and gradient of 102,400"
 Record = dict[str, Any]  # what the command `benchmarks.speed` writes
 
 
 def gpu() -> str:
     """Updates, training and queries on one GPU."""
-    record = records.read(records.RESULTS / "speed_h100.json")
+    record = records.read(records.RESULTS / "speed_h200.json")
     training = "the paper's training, 10 epochs of 60,000"
     rows = {
         "an update, `Config.default`": "update, default",
         "an update, `Config.paper`": "update, paper",
-        "the same, Eikonal loss on half of the samples": f"update, paper, {_HALF}",
+        "the same, the old map donated": "update, paper, donated",
         "the paper's training, 10 epochs of 60,000 samples": training,
-        "its training, Eikonal loss on half of the samples": f"{training}, {_HALF}",
         "102,400 distances with gradient, the paper's network": f"{_QUERY}, the paper's network",
         "102,400 distances with gradient, `Config.default`": f"{_QUERY}, blended, default",
         "1,048,576 distances with gradient, baked at 5 cm": (
@@ -45,7 +41,7 @@ def gpu() -> str:
         for label, name in rows.items()
     ]
     columns = ["median", "p99", "compiled function alone", "PyTorch eager, TF32"]
-    return lay_out(["one H100, ms", *columns], cells)
+    return lay_out(["one H200, ms", *columns], cells)
 
 
 def cpu() -> str:
@@ -75,7 +71,7 @@ def cpu() -> str:
 
 def stages() -> str:
     """The stages of an update one by one, on a GPU and on two CPU cores."""
-    gpu, cpu = (records.read(records.RESULTS / f"speed_{one}.json") for one in ("h100", "cpu"))
+    gpu, cpu = (records.read(records.RESULTS / f"speed_{one}.json") for one in ("h200", "cpu"))
     known = {stage.__name__ for stage in STAGES}
     names = [row["name"].removesuffix(", paper") for row in gpu["rows"]]
     cells = [
@@ -87,53 +83,29 @@ def stages() -> str:
         for name in names
         if known.issuperset(name.split(" + "))  # a record may have two stages in one row
     ]
-    return lay_out(["stage, ms", "H100, `Config.paper`", "two CPU cores, `Config.light`"], cells)
-
-
-def runs() -> str:
-    """Whole updates over all runs on one kind of GPU, each on a machine of its own."""
-    found = records.read(records.RESULTS / "speed_h100_runs.json")
-    cells = []
-    for label, name in (
-        ("`Config.default`", "update, default"),
-        ("`Config.paper`", "update, paper"),
-        ("`Config.paper`, Eikonal loss on half of the samples", f"update, paper, {_HALF}"),
-    ):
-        rows = [row for row in (_row(record, name) for record in found) if row]
-        cells.append([label, str(len(rows)), *(_range(rows, key) for key in ("median", "p99"))])
-    for record in found:
-        if donated := _row(record, "update, paper, donated"):
-            kept = _beside(record, "update, paper, donated")
-            for label, row in (("kept", kept), ("donated, in turns with it", donated)):
-                numbers = (_number(row, key) for key in ("median", "p99"))
-                cells.append([f"`Config.paper`, the old map {label}", "1", *numbers])
-    return lay_out(["an update, ms", "runs", "median", "p99"], cells)
+    return lay_out(["stage, ms", "H200, `Config.paper`", "two CPU cores, `Config.light`"], cells)
 
 
 def ratios() -> str:
-    """How an update grows with the map and with the number of updates, over the same runs."""
-    found = records.read(records.RESULTS / "speed_h100_runs.json")
-    pairs = [
-        (_row(record, "update, light, a map of 60 m"), _row(record, "update, light, a map of 10 m"))
-        for record in found
-    ]
+    """How an update grows with the map and with the number of updates."""
+    record = records.read(records.RESULTS / "speed_h200.json")
+    sizes = [_row(record, f"update, light, a map of {edge} m") for edge in (60, 10)]
     last = "10,000 updates in a row, light, last 10 %"
-    ends = [(_row(record, last), _beside(record, last)) for record in found]
-    cells = []
-    for label, both in (
-        ("map of 60 m : map of 10 m around the same sensor", pairs),
-        ("last thousand of 10,000 updates : first thousand", ends),
-    ):
-        found = [{"ratio": one["median"] / other["median"]} for one, other in both if one and other]
-        cells.append([label, str(len(found)), _range(found, "ratio")])
-    return lay_out(["`Config.light`, medians", "runs", "ratio"], cells)
+    ends = [_row(record, last), _beside(record, last)]
+    cells = [
+        [label, f"{one['median'] / other['median']:.2f}"]
+        for label, (one, other) in (
+            ("map of 60 m : map of 10 m around the same sensor", sizes),
+            ("last thousand of 10,000 updates : first thousand", ends),
+        )
+    ]
+    return lay_out(["`Config.light`, one H200, medians", "ratio"], cells)
 
 
 TABLES = {
     "speed-gpu": gpu,
     "speed-cpu": cpu,
     "speed-stages": stages,
-    "speed-runs": runs,
     "speed-ratios": ratios,
 }
 
@@ -161,9 +133,3 @@ def _with_unit(row: dict[str, Any], unit: str) -> str:
     if value >= 1000 and unit in larger:
         value, unit = value / 1000, larger[unit]
     return f"{format_number(value)} {unit}"
-
-
-def _range(rows: list[dict[str, Any]], key: str) -> str:
-    values = [row[key] for row in rows]
-    low, high = (format_number(float(one)) for one in (np.min(values), np.max(values)))
-    return low if low == high else f"{low} to {high}"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import hashlib
 import os
 import re
 import shutil
@@ -23,6 +24,7 @@ from typing import BinaryIO
 _Path = str | os.PathLike[str]
 
 _ASIDE = r"\.[0-9a-f]{32}\.part"
+_LONGEST = 100  # bytes; file systems allow 143 or 255, and 38 are added
 _TOGETHER = "results"  # files that replace others together lie in results.<32 digits>.part/
 
 
@@ -132,7 +134,7 @@ def check_output_folder(folder: _Path, names: Sequence[str]) -> None:
             file, or read-only.
     """
     folder = Path(folder)
-    nearest = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+    nearest = next(each for each in (folder, *folder.parents) if _exists(each))
     if not nearest.is_dir():
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(nearest))
     if nearest == folder:
@@ -142,6 +144,15 @@ def check_output_folder(folder: _Path, names: Sequence[str]) -> None:
         aside, held = _make_folder_aside(nearest)
     os.close(held)
     aside.rmdir()
+
+
+def _exists(path: Path) -> bool:
+    """Whether there is such an entry; raises an OSError if there cannot be, as for a long name."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 def _target(path: _Path) -> Path:
@@ -201,7 +212,13 @@ def _make_folder_aside(folder: Path) -> tuple[Path, int]:
 
 
 def _name_aside(folder: Path, name: str) -> Path:
-    return folder / f"{name}.{uuid.uuid4().hex}.part"
+    return folder / f"{_short(name)}.{uuid.uuid4().hex}.part"
+
+
+def _short(name: str) -> str:
+    """A name that leaves room for more: the name itself, or for a long one a hash of it."""
+    encoded = os.fsencode(name)
+    return name if len(encoded) <= _LONGEST else hashlib.sha256(encoded).hexdigest()
 
 
 def _hold(descriptor: int, aside: Path) -> bool:
@@ -216,7 +233,7 @@ def _hold(descriptor: int, aside: Path) -> bool:
 
 def _remove_abandoned(folder: Path, name: str) -> None:
     """Removes what killed writers of a file have left beside it."""
-    pattern = re.compile(re.escape(name) + _ASIDE)
+    pattern = re.compile(re.escape(_short(name)) + _ASIDE)
     with contextlib.suppress(OSError):  # a folder that may be written, but not listed
         for entry in list(os.scandir(folder)):
             if pattern.fullmatch(entry.name):

@@ -22,7 +22,7 @@ from hiosdf_jax._src.mapping.stages import (
 )
 from hiosdf_jax._src.network.training import init_network
 from hiosdf_jax._src.numerics.arrays import on_device, scalar
-from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.intake import as_array, as_key, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
     as_traced,
@@ -56,7 +56,7 @@ def init(config: Config, key: jax.Array) -> MapState:
     """
     if not isinstance(config, Config):
         raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
-    key = _typed_key(key)
+    key = as_key("key", key)
     key, network_key = jax.random.split(key)
 
     def zero() -> jax.Array:  # one array per leaf, so that the state can be donated
@@ -212,12 +212,11 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
         ValueError: `state` is not a map, or `stamp` is not one number, finite in float32.
     """
     check_map(state, stacked=True)
-    seconds = on_device("stamp", stamp)
-    known = isinstance(stamp, jax.Array) or np.isfinite(seconds)  # nothing waits for it
-    if seconds.shape != () or not known:
+    seconds = as_array("stamp", stamp)
+    if seconds.shape != () or not (is_traced(seconds) or np.isfinite(jax.device_get(seconds))):
         raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
     field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=seconds)
+    return field.replace(stamp=on_device("stamp", seconds))
 
 
 def grow(state: MapState, bounds: Any) -> MapState:
@@ -280,17 +279,3 @@ def trace_update(
 _update_jit = jax.jit(trace_update)
 # Also leaves that an update does not read are donated.
 _update_donating = jax.jit(trace_update, donate_argnums=0, keep_unused=True)
-
-
-def _typed_key(key: Any) -> jax.Array:
-    try:
-        array = key if isinstance(key, jax.Array) else jnp.asarray(key)
-    except Exception as error:  # whatever a foreign object raises
-        raise ValueError(f"key is {type(key).__name__}, expected one jax.random.key") from error
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) and array.shape == ():
-        return array
-    if array.dtype == jnp.uint32 and array.shape == (2,):
-        return jax.random.wrap_key_data(array)
-    raise ValueError(
-        f"key has dtype {array.dtype} and shape {array.shape}, expected one jax.random.key"
-    )

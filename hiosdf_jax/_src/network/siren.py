@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.network import hopper, tiles
+from hiosdf_jax._src.network import evaluation
 from hiosdf_jax._src.network.fast_sine import sine
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.numerics.modes import plain
@@ -69,7 +69,7 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
     Returns:
         (...) m. Differentiable any number of times.
     """
-    return tiles.map_tiles(lambda rows: hopper.value(config.frequency, params, rows), points)
+    return evaluation.value(config.frequency, params, points)
 
 
 @functools.partial(predict.defjvp, symbolic_zeros=True)
@@ -96,9 +96,7 @@ def predict_with_gradient(
     Returns:
         The values (...) m and their gradients (..., 3). Differentiable any number of times.
     """
-    return tiles.map_tiles(
-        lambda rows: hopper.value_and_gradient(config.frequency, params, rows), points
-    )
+    return evaluation.value_and_gradient(config.frequency, params, points)
 
 
 @predict_with_gradient.defjvp

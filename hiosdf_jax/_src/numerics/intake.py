@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 _DEEPEST = 16  # an array has three axes or four
+_MOST_WHOLE = 2**31 - 1  # a loop counts in int32
 
 
 def as_real(name: str, values: Any) -> np.ndarray:
@@ -117,10 +118,49 @@ def as_number(name: str, value: Any, least: float | None = None, *, above: bool 
     raise ValueError(f"{name} is {value!r}, expected {bound} and finite")
 
 
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Raises a ValueError if a count that shapes or loops depend on is no whole number >= least."""
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
+def check_whole(name: str, value: Any, least: int, most: int = _MOST_WHOLE) -> None:
+    """Checks a count that shapes or loops depend on.
+
+    Args:
+        name: What messages call the argument.
+        value: The count, not traced.
+        least: Its least value.
+        most: Its largest value.
+
+    Raises:
+        ValueError: It is no whole number, or out of range.
+    """
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not (whole and int(value) >= least):
         raise ValueError(f"{name} is {value!r}, expected a whole number >= {least}")
+    if int(value) > most:
+        raise ValueError(f"{name} is {value!r}, expected at most {most}")
+
+
+def as_key(name: str, key: Any) -> jax.Array:
+    """Checks that an argument is one random key.
+
+    Args:
+        name: What messages call the argument.
+        key: From `jax.random.key`, or an older one from `PRNGKey`; may be traced.
+
+    Returns:
+        The typed key.
+
+    Raises:
+        ValueError: It is something else, or several keys.
+    """
+    try:
+        array = key if isinstance(key, jax.Array) else jnp.asarray(key)
+    except Exception as error:  # whatever a foreign object raises
+        raise ValueError(f"{name} is {type(key).__name__}, expected one jax.random.key") from error
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) and array.shape == ():
+        return array
+    if array.dtype == jnp.uint32 and array.shape == (2,):
+        return jax.random.wrap_key_data(array)
+    raise ValueError(
+        f"{name} has dtype {array.dtype} and shape {array.shape}, expected one jax.random.key"
+    )
 
 
 def is_traced(*values: Any) -> bool:

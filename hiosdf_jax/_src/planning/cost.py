@@ -36,9 +36,16 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
         (...) m. Differentiable.
 
     Raises:
-        ValueError: (Outside jit) the margin is not positive and finite.
+        ValueError: A shape is wrong, or (outside jit) the margin is not positive and finite.
     """
     clearance, margin = on_device("clearance", clearance), on_device("margin_m", margin_m)
+    try:
+        np.broadcast_shapes(clearance.shape, margin.shape)
+    except ValueError:
+        raise ValueError(
+            f"margin_m has shape {margin.shape}, expected one that broadcasts with that of "
+            f"clearance, {clearance.shape}"
+        ) from None
     if not is_traced(margin):
         values = np.asarray(jax.device_get(margin))
         if not ((values >= _LEAST_M) & (values <= _MOST_M)).all():

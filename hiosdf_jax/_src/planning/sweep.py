@@ -62,7 +62,7 @@ def swept_clearance(
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.
         slope: Steepest slope of the field, m per m, () > 0.
-        evaluations: Evaluations of the field per sphere, >= 2; a whole number, not traced.
+        evaluations: Evaluations of the field per sphere, 2 to 10,000; a whole number, not traced.
 
     Returns:
         (...) float32, m. Differentiable.
@@ -136,7 +136,7 @@ def _checked(
         raise ValueError(
             f"end_world has shape {shapes[1]}, expected that of start_world {shapes[0]}"
         )
-    check_whole("evaluations", evaluations, 2)
+    check_whole("evaluations", evaluations, 2, _MOST_EVALUATIONS)
     if not is_traced(slope):
         slope = as_number("slope", slope, 0, above=True)
     slope = on_device("slope", slope)
@@ -146,6 +146,7 @@ def _checked(
 
 
 _STEEPEST = 1e6
+_MOST_EVALUATIONS = 10_000  # each looks through all segments so far
 
 _CHOICES = ("unknown", "bound", "evaluations")
 

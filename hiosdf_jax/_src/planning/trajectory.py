@@ -11,7 +11,7 @@ import optax
 from hiosdf_jax._src.field.points import AnyField, Unknown, distance_and_grad
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import least
-from hiosdf_jax._src.numerics.intake import as_number, check_whole, is_traced
+from hiosdf_jax._src.numerics.intake import as_key, as_number, check_whole, is_traced
 from hiosdf_jax._src.numerics.modes import plain, varying_like
 from hiosdf_jax._src.numerics.vectors import length, split
 from hiosdf_jax._src.state import Bound
@@ -21,6 +21,8 @@ _SAMPLES_PER_SEGMENT = 4
 
 # Weight of the squared intrusion, 1/m^2. The band's energy is relative to the straight line's.
 _INTRUSION_WEIGHT = 2000.0
+
+_MOST_POINTS = 2**31 // 3  # whose coordinates an int32 counts
 
 
 class Trajectory(NamedTuple):
@@ -60,12 +62,18 @@ def waves(
     Raises:
         ValueError: A shape or a type is wrong, or a number is out of range.
     """
+    key = as_key("key", key)
     start, goal = on_device("start_world", start_world), on_device("goal_world", goal_world)
     for name, ends in (("start_world", start), ("goal_world", goal)):
         if ends.shape != (3,):
             raise ValueError(f"{name} has shape {ends.shape}, expected (3,)")
     check_whole("count", count, 1)
     check_whole("waypoints", waypoints, 2)
+    if count * waypoints > _MOST_POINTS:
+        raise ValueError(
+            f"count is {count} and waypoints is {waypoints}, expected a product of at most "
+            f"{_MOST_POINTS}"
+        )
     if not is_traced(spread_m):
         spread_m = as_number("spread_m", spread_m, 0)
     along = jnp.linspace(0, 1, waypoints, dtype=jnp.float32)[:, None]

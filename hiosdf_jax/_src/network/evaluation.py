@@ -1,14 +1,19 @@
-"""Chooses how a SIREN is evaluated: by one kernel on a Hopper GPU, else by XLA."""
+"""Evaluates a SIREN at many points: by one kernel on a Hopper GPU, else by XLA, tile by tile.
+
+`jax.vmap` over points makes more rows of one evaluation, so that a planner which is written for one
+point is as fast as a batch.
+"""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from hiosdf_jax._src.network import forward
+from hiosdf_jax._src.network import forward, tiles
 
 _HOPPER = "9.0"  # CUDA's compute capability
 _WIDTHS = (128, 256)
@@ -28,11 +33,10 @@ def value(frequency: float, params: Any, points: jax.Array) -> jax.Array:
         points: (..., 3) m, relative to the network's origin.
 
     Returns:
-        (...) m. Without a derivative where a kernel computes it.
+        (...) m. Without a derivative in reverse mode.
     """
-    if not _has_kernel(params):
-        return forward.value(frequency, params, points)
-    return _value(jnp.float32(frequency), params, points)
+    function = _chosen_value if _has_kernel(params) else _value
+    return function(jnp.float32(frequency), params, points)
 
 
 def value_and_gradient(
@@ -46,12 +50,10 @@ def value_and_gradient(
         points: (..., 3) m, relative to the network's origin.
 
     Returns:
-        The values (...) m and their gradients (..., 3). Without a derivative where a kernel
-        computes them.
+        The values (...) m and their gradients (..., 3). Without a derivative in reverse mode.
     """
-    if not _has_kernel(params):
-        return forward.value_and_gradient(frequency, params, points)
-    return _value_and_gradient(jnp.float32(frequency), params, points)
+    function = _chosen_value_and_gradient if _has_kernel(params) else _value_and_gradient
+    return function(jnp.float32(frequency), params, points)
 
 
 def is_available() -> bool:
@@ -73,41 +75,24 @@ def _has_kernel(params: Any) -> bool:
     return fits and is_available()
 
 
-@custom_vmap
-def _value(frequency: jax.Array, params: Any, points: jax.Array) -> jax.Array:
-    def by_kernel(frequency: jax.Array, params: Any, points: jax.Array) -> jax.Array:
-        return _by_kernel(frequency, params, points, with_gradient=False)[0]
-
-    return _choose(by_kernel, forward.value, frequency, params, points)
+def _value_by_xla(frequency: Any, params: Any, points: jax.Array) -> jax.Array:
+    return tiles.map_tiles(lambda rows: forward.value(frequency, params, rows), points)
 
 
-@custom_vmap
-def _value_and_gradient(
-    frequency: jax.Array, params: Any, points: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    def by_kernel(frequency: jax.Array, params: Any, points: jax.Array) -> Any:
-        return _by_kernel(frequency, params, points, with_gradient=True)
-
-    return _choose(by_kernel, forward.value_and_gradient, frequency, params, points)
+def _value_and_gradient_by_xla(frequency: Any, params: Any, points: jax.Array) -> Any:
+    return tiles.map_tiles(lambda rows: forward.value_and_gradient(frequency, params, rows), points)
 
 
-@_value.def_vmap
-def _value_of_batch(size: int, batched: Any, *arguments: Any) -> Any:
-    return _batch(_value, forward.value, batched, arguments), True
+def _choose_value(frequency: jax.Array, params: Any, points: jax.Array) -> jax.Array:
+    def by_kernel(*arguments: Any) -> jax.Array:
+        return _by_kernel(*arguments, with_gradient=False)[0]
+
+    return _choose(by_kernel, _value_by_xla, frequency, params, points)
 
 
-@_value_and_gradient.def_vmap
-def _value_and_gradient_of_batch(size: int, batched: Any, *arguments: Any) -> Any:
-    result = _batch(_value_and_gradient, forward.value_and_gradient, batched, arguments)
-    return result, (True, True)
-
-
-def _batch(function: Any, by_xla: Any, batched: Any, arguments: Any) -> Any:
-    """Takes a batch of points as more rows; several networks at once are left to XLA."""
-    if any(jax.tree.leaves(batched[:2])):
-        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
-        return jax.vmap(by_xla, axes)(*arguments)
-    return function(*arguments)
+def _choose_value_and_gradient(frequency: jax.Array, params: Any, points: jax.Array) -> Any:
+    by_kernel = functools.partial(_by_kernel, with_gradient=True)
+    return _choose(by_kernel, _value_and_gradient_by_xla, frequency, params, points)
 
 
 def _choose(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
@@ -118,6 +103,28 @@ def _choose(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
     if _INTERPRET is not None:
         return by_kernel(*arguments)
     return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
+
+
+def _batching(function: Any, by_xla: Any) -> Any:
+    """Takes a batch of points as more rows; several networks at once are left to XLA."""
+    wrapped = custom_vmap(function)
+
+    def of_batch(size: int, batched: Any, *arguments: Any) -> Any:
+        if any(jax.tree.leaves(batched[:2])):
+            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+            result = jax.vmap(by_xla, axes)(*arguments)
+        else:
+            result = wrapped(*arguments)
+        return result, jax.tree.map(lambda _: True, result)
+
+    wrapped.def_vmap(of_batch)
+    return wrapped
+
+
+_value = _batching(_value_by_xla, _value_by_xla)
+_chosen_value = _batching(_choose_value, _value_by_xla)
+_value_and_gradient = _batching(_value_and_gradient_by_xla, _value_and_gradient_by_xla)
+_chosen_value_and_gradient = _batching(_choose_value_and_gradient, _value_and_gradient_by_xla)
 
 
 def _by_kernel(

@@ -1,0 +1,1 @@
+"""Mapping beside a controller, in a thread or in a process of its own."""
