@@ -58,6 +58,7 @@ def save_paths(
         label="standard deviation of the refined position",
     )
     over_time.set(xlabel="frame", ylabel="cm", title="corrections")
+    over_time.margins(y=0.25)  # room for the legend
     over_time.set_ylim(bottom=0)
     over_time.legend()
     with replacing(path) as file:
