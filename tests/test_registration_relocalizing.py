@@ -32,7 +32,7 @@ def furnished_distance(points):
 def baked(distance):
     half = HALF + 0.6
     shape = tuple(np.ceil(2 * half / RESOLUTION).astype(int) + 1)
-    values = distance(-half + RESOLUTION * np.stack(np.indices(shape), axis=-1))
+    values = distance(-half + RESOLUTION * np.moveaxis(np.indices(shape), 0, -1))
     return hio.Baked(
         corner_world=jnp.asarray(-half, jnp.float32),
         resolution=jnp.float32(RESOLUTION),
@@ -81,7 +81,10 @@ def test_a_symmetric_room_has_two_answers():
     cloud, pose = room_cloud(3, COUNT, 0.4, (0.2, 0.1, 0.05))
     found = hio.relocalize(baked(room_distance), cloud, jax.random.key(0), HYPOTHESES)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    errors = [min(away(each.pose, p)[0] for p in (pose, half_turn @ pose)) for each in found[::2]]
+    errors = [
+        min(away(each.pose, p)[0] for p in (pose, half_turn @ pose))
+        for each in (found.best, found.other)
+    ]
     assert max(errors) < 0.01
     assert abs(float(found.score) - float(found.other_score)) < 0.02
     way, turn = away(found.best.pose, np.asarray(found.other.pose, float))
@@ -129,6 +132,7 @@ def test_an_empty_map_knows_no_place(empty_map):
         ({"field": 3}, "field is int"),
         ({"cloud": np.zeros((5, 2))}, r"cloud has shape \(5, 2\)"),
         ({"cloud": np.full((5, 3), np.nan)}, "cloud has no finite row"),
+        ({"key": 3}, "key has dtype"),
         ({"hypotheses": 10}, "hypotheses is 10, expected a whole number >= 256"),
         ({"up_sensor": (0, 0)}, r"up_sensor has shape \(2,\), expected \(3,\)"),
         ({"up_world": (0, 0, 0)}, r"up_world is \(0, 0, 0\), expected a direction"),

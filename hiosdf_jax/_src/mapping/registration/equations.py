@@ -32,10 +32,10 @@ _TRACKING_M = 0.2
 
 # A direction is free if the returns fit about as well where they are moved this far along it, m: if
 # their mean loss, which is at most 1, grows by less than this. Its slope alone does not tell: noise
-# turns the normals of patches. In maps of corridors it grows by at most 0.001 along them, and in a
-# furnished house by at least 0.005. A baked field does not know how noisy it is.
+# turns the normals of patches. In maps of corridors it grows by at most 0.0035 along them, and in a
+# furnished house by at least 0.0069. A baked field does not know how noisy it is.
 _TRIED_M = 0.2
-_LEAST_GROWTH = 0.002
+_LEAST_GROWTH = 0.004
 _LEAST_GROWTH_BAKED = 0.01
 
 # As many of the least determined directions are tried: a plane leaves three free.

@@ -27,7 +27,7 @@ from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_ang
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import solve_coarse
-from hiosdf_jax._src.numerics.intake import as_array, check_whole, is_traced
+from hiosdf_jax._src.numerics.intake import as_array, as_key, check_whole, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.posed_cloud import as_traced, checked_cloud, finite_rows
 from hiosdf_jax._src.state import Baked, Field
@@ -109,6 +109,7 @@ def relocalize(
     """
     field = as_field(field)
     check_whole("hypotheses", hypotheses, _KEPT)
+    key = as_key("key", key)
     ups = [_direction("up_sensor", up_sensor), _direction("up_world", up_world)]
     traced = is_traced(*jax.tree.leaves((field, key)), cloud, *ups)
     if traced:
