@@ -157,7 +157,7 @@ def compare(
     """
     offset = jnp.sum(rows.points[:, None, :] * pose[:3, :3], axis=-1)
     points_world = offset + pose[:3, 3]
-    match = match_points(field, points_world)
+    match = match_points(field, points_world, rows.some)
     # Only the part of the error along the normal counts.
     square = jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-6)
     along = jnp.minimum(jnp.sum(match.normal * offset, axis=-1) ** 2 / square, 1)

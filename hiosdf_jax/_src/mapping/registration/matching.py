@@ -20,6 +20,14 @@ _LEAST_SLOPE = 0.5
 _MOST_BESIDE_VOXELS = 0.8
 _LEAST_WIDTH_VOXELS = 0.1
 
+# Patches that were hit a few times are narrow, and points beside them are not nearer to the surface
+# on their side. Where the patches of a cloud are up to the first mean width, voxels, distances are
+# those from their planes; from the second one on, those of the map, which are twice as exact. Rooms
+# of 300 hits a frame have 0.16 to 0.19, and a house of 77,000 has 0.21 after the first frame, and
+# 0.23 to 0.26 in the end.
+_NARROW_VOXELS = 0.20
+_WIDE_VOXELS = 0.22
+
 # A return contradicts the map if it is this far inside observed space, and this far from patches.
 _FREE_VOXELS = 0.5
 _EMPTY_VOXELS = 1.5
@@ -48,7 +56,7 @@ class Match(NamedTuple):
     empty: jax.Array
 
 
-def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
+def match_points(field: Field | Baked, points_world: jax.Array, some: jax.Array) -> Match:
     """Compares points with a map.
 
     A live map answers by its grid alone: the network changes no surface and costs more.
@@ -56,6 +64,7 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
     Args:
         field: The map.
         points_world: (N, 3) m, finite.
+        some: The row is a point, (N,) bool.
 
     Returns:
         The comparison. Differentiable by the points.
@@ -84,8 +93,19 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
         empty = inside & free & (plane.away > _EMPTY_VOXELS * config.voxel_size)
         inside &= plane.beside < _MOST_BESIDE_VOXELS * config.voxel_size
         inside &= plane.width > _LEAST_WIDTH_VOXELS * config.voxel_size
+        share = _share_of_map(plane.width / config.voxel_size, some & inside)
+        distance = share * distance + (1 - share) * plane.height
+        normal = share * normal + (1 - share) * plane.normal
+        spread = share * spread + (1 - share) * plane.spread
     steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
     return Match(distance, normal, spread, depth, inside & steep, empty)
+
+
+def _share_of_map(width: jax.Array, usable: jax.Array) -> jax.Array:
+    """How far distances are the map's own, not those from planes: from 0 to 1, for all points."""
+    total = jnp.sum(jnp.where(usable, jax.lax.stop_gradient(width), 0))
+    mean = total / jnp.maximum(jnp.sum(usable), 1)
+    return jnp.clip((mean - _NARROW_VOXELS) / (_WIDE_VOXELS - _NARROW_VOXELS), 0, 1)
 
 
 def noise_of(field: Field | Baked) -> tuple[float, float]:

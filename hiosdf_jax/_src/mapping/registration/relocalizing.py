@@ -20,13 +20,12 @@ from hiosdf_jax._src.mapping.registration.equations import (
     Rows,
     compare,
     make_rows,
-    take_rows,
 )
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
-from hiosdf_jax._src.mapping.registration.solving import solve_coarse
+from hiosdf_jax._src.mapping.registration.solving import solve_coarse, take_evenly
 from hiosdf_jax._src.numerics.intake import as_array, as_key, check_whole, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.posed_cloud import as_traced, checked_cloud, finite_rows
@@ -182,7 +181,7 @@ def _find_places(
     starts = jax.vmap(pose_of)(positions[kept], angles[kept])
 
     rows = _rows(field, points, some)
-    fewer = take_rows(rows, slice(None, None, _SCORED_ROWS // _KEPT_ROWS))
+    fewer = take_evenly(rows, _KEPT_ROWS)
 
     def improve(start: jax.Array) -> tuple[jax.Array, jax.Array]:
         pose = solve_coarse(field, fewer, start, Anchor(start, None), _REACH_M)

@@ -21,7 +21,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     take_rows,
 )
 from hiosdf_jax._src.mapping.registration.motion import move
-from hiosdf_jax._src.mapping.registration.selection import draw_informative
+from hiosdf_jax._src.mapping.registration.selection import draw_informative, even_steps
 from hiosdf_jax._src.state import Baked, Field
 
 # Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
@@ -50,10 +50,10 @@ _FINISHED_M = 5e-6
 _RESTING_M = 2e-3
 
 
-def take_evenly(rows: Rows) -> Rows:
-    """Selects rows at even steps, as many as coarse steps use."""
-    every = max(rows.points.shape[0] // _COARSE_ROWS, 1)
-    return take_rows(rows, slice(None, None, every))
+def take_evenly(rows: Rows, count: int = _COARSE_ROWS) -> Rows:
+    """Selects returns at even steps, or all if there are fewer; the rows begin with the returns."""
+    count = min(count, rows.points.shape[0])
+    return take_rows(rows, even_steps(jnp.sum(rows.some), count).astype(jnp.int32))
 
 
 def solve_coarse(
@@ -94,12 +94,13 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
         pose: (4, 4), near the solution.
 
     Returns:
-        Indices of rows, at most as many as fine steps use, all of them if there are no more; and
+        Indices of rows, at most as many as fine steps use, all returns if there are no more; and
         the principal directions of the returns.
     """
     directions = find_directions(field, take_evenly(rows), pose)
     if rows.points.shape[0] <= _FINE_ROWS:
         return jnp.arange(rows.points.shape[0]), directions
+    whole = jnp.arange(_FINE_ROWS, dtype=jnp.int32)
     residuals = compare(field, rows, pose, _SELECTED_M)
     information = information_of(residuals)
     # Free directions must not draw all rows.
@@ -107,7 +108,8 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
     information += (directions.basis * held) @ directions.basis.T
     information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6)
     row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
-    return row, directions
+    # A small cloud that is padded gives the same pose as without padding.
+    return jnp.where(jnp.sum(rows.some) <= _FINE_ROWS, whole, row), directions
 
 
 def solve_fine(
