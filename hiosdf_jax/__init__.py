@@ -14,18 +14,21 @@ from hiosdf_jax._src.field.points import query, sdf, sdf_and_grad
 from hiosdf_jax._src.mapping.background.mapper import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
+from hiosdf_jax._src.mapping.merging import correct, merge, transform
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
 from hiosdf_jax._src.mapping.tracking import predict_pose, track
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
+from hiosdf_jax._src.view.live import Viewer, view
 
 if TYPE_CHECKING:
     from hiosdf_jax import datasets as datasets
     from hiosdf_jax import demo as demo
+    from hiosdf_jax import exports as exports
+    from hiosdf_jax import pictures as pictures
     from hiosdf_jax import scoring as scoring
-    from hiosdf_jax import view as view
 
 __version__ = "0.1.0"
 
@@ -40,12 +43,15 @@ __all__ = [
     "Registration",
     "Relocalization",
     "Report",
+    "Viewer",
     "bake",
+    "correct",
     "extract_mesh",
     "forget",
     "grow",
     "init",
     "load",
+    "merge",
     "moving_rows",
     "pad_cloud",
     "planning",
@@ -58,10 +64,12 @@ __all__ = [
     "sdf_and_grad",
     "snapshot",
     "track",
+    "transform",
     "update",
+    "view",
 ]
 
-_MODULES = ("datasets", "demo", "scoring", "view")
+_MODULES = ("datasets", "demo", "exports", "pictures", "scoring")
 
 
 def __getattr__(name: str) -> ModuleType:

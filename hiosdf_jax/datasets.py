@@ -22,6 +22,7 @@ from hiosdf_jax._src.datasets.stream import (
     find_bounds,
     read_frame,
 )
+from hiosdf_jax._src.datasets.trajectory import write_tum
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.datasets.tum import tum_stream
 
@@ -45,4 +46,5 @@ __all__ = [
     "rosbag_stream",
     "scannet_stream",
     "tum_stream",
+    "write_tum",
 ]

@@ -21,6 +21,7 @@ from hiosdf_jax._src.scoring.metrics import (
     evaluate_lower,
     held_out_surface,
 )
+from hiosdf_jax._src.scoring.rows import write_csv
 from hiosdf_jax._src.scoring.scene import Scene, mesh_scene, read_scene
 from hiosdf_jax._src.scoring.surface import (
     evaluate_held_out_mesh,
@@ -55,4 +56,5 @@ __all__ = [
     "sample_visible",
     "score_held_out",
     "sensor_path",
+    "write_csv",
 ]

@@ -1,4 +1,4 @@
-"""Mutated recordings and maps, read in a process of its own with little memory.
+"""Mutated recordings, maps and meshes, read in a process of its own with little memory.
 
     python tests/mutations.py FIRST COUNT
 
@@ -146,6 +146,7 @@ def write_recordings(folder):
     """Writes an honest recording of each kind; returns {name: (path, function that reads it)}."""
     import jax
     import test_datasets_npz as npz
+    import trimesh
     from recordings import write_scannet, write_tum
     from test_datasets_clouds import write_clouds, write_poses
     from test_datasets_kitti import write_kitti
@@ -153,7 +154,7 @@ def write_recordings(folder):
     from test_datasets_rosbag import write_bag
 
     import hiosdf_jax as hio
-    from hiosdf_jax import datasets
+    from hiosdf_jax import datasets, scoring
 
     found = {}
     for name, arrays in (("depth", npz.DEPTH), ("range", npz.RANGE), ("points", npz.POINTS)):
@@ -168,6 +169,17 @@ def write_recordings(folder):
         write_poses(found[suffix] / "poses.txt", range(4))
     for kind in ("ros1", "sqlite3", "mcap"):
         found[kind] = write_bag(folder / f"bag_{kind}", kind)
+
+    for kind in ("ply", "obj", "stl", "off", "glb"):
+        (folder / f"mesh_{kind}").mkdir()
+        found[f"mesh_{kind}"] = folder / f"mesh_{kind}" / f"box.{kind}"
+        trimesh.creation.box((2, 2, 2)).export(found[f"mesh_{kind}"])
+
+    def read_mesh(path):
+        scene = scoring.read_scene(path, np.zeros((3, 3)))
+        sdf, grad = scene.sdf_and_grad(np.linspace([-1, -1, -2], [1, 2, 1], 20))
+        assert np.isfinite(sdf).all() and np.isfinite(grad).all()
+        scene.cast(np.zeros((3, 3)), np.eye(3))
 
     def read_stream(path):
         options = {"intrinsics": (6.0, 5.0, 3.3, 2.1)} if path.name == "freiburg1" else {}
@@ -204,8 +216,9 @@ def write_recordings(folder):
     (folder / "map").mkdir()
     hio.save(folder / "map" / "map.npz", hio.init(config, jax.random.key(0)))
     found["map"] = folder / "map" / "map.npz"
+    readers = {"map": read_map, "mesh": read_mesh}
     return {
-        name: (path, read_map if name == "map" else read_stream) for name, path in found.items()
+        name: (path, readers.get(name.split("_")[0], read_stream)) for name, path in found.items()
     }
 
 

@@ -189,6 +189,18 @@ def test_help_teaches_by_examples(capsys, command, texts):
         assert each in " ".join(text.split())
 
 
+@pytest.mark.parametrize(
+    "module, package", [("jax_mppi", "jax-mppi"), ("skimage.graph", "scikit-image")]
+)
+def test_the_plan_names_the_package_that_it_misses(monkeypatch, tmp_path, capsys, module, package):
+    for name in ("exploration", "driver"):
+        monkeypatch.delitem(sys.modules, f"hiosdf_jax._src.demo.{name}", raising=False)
+        monkeypatch.delattr(f"hiosdf_jax._src.demo.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert cli.main(["demo", "--plan", "--output", str(tmp_path)]) == 2
+    assert f"--plan needs {package}: in a clone, pip install '.[plan]'" in capsys.readouterr().err
+
+
 def test_the_plan_has_no_frames_or_configuration(capsys):
     for option in (["--frames", "3"], ["--config", "light"]):
         assert cli.main(["demo", "--plan", *option]) == 2

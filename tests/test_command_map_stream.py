@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.image import imread
+from PIL import Image
 from room_files import (
     BOX,
     RAYS,
@@ -26,8 +27,8 @@ def metrics_of(folder):
     return json.loads((folder / "metrics.json").read_text("utf-8"))
 
 
-def check_pictures(folder):
-    assert {path.name for path in folder.iterdir()} == OUTPUTS
+def check_pictures(folder, outputs=OUTPUTS):
+    assert {path.name for path in folder.iterdir()} == outputs
     for name in ("slices.png", "mesh.png"):
         picture = imread(folder / name)[..., :3]
         assert min(picture.shape[:2]) > 400
@@ -112,7 +113,9 @@ def test_the_first_bad_frame_ends_the_run(tmp_path, capsys, monkeypatch):
 def test_the_demo(tmp_path, capsys):
     output = tmp_path / "demo"
     assert cli.main(["demo", "--output", str(output), "--frames", "3", "--config", "light"]) == 0
-    check_pictures(output)
+    check_pictures(output, OUTPUTS | {"growing.gif"})
+    with Image.open(output / "growing.gif") as growing:
+        assert (growing.n_frames, growing.size) == (3, (640, 480))
     metrics = metrics_of(output)
     assert (metrics["stream"], metrics["updates"]) == ("demo", 3)
     assert set(metrics["scores"]) >= {

@@ -60,6 +60,15 @@ def one_line(capsys):
     return line.removeprefix("hiosdf: ")
 
 
+RECORDINGS = {  # what a folder must hold
+    "tum": ["depth.txt", "groundtruth.txt"],
+    "kitti": ["velodyne"],
+    "scannet": ["depth", "pose", "intrinsic"],
+    "replicacad": ["traj.txt", "results"],
+    "rosbag": ["metadata.yaml"],
+}
+
+
 def case(tmp_path, kind):
     """Arguments that cannot work, and the message that says so."""
     stream = tmp_path / "stream.npz"
@@ -110,6 +119,10 @@ def case(tmp_path, kind):
     if kind == "output into a folder of clouds":
         (out / "000001.pcd").write_bytes(b"a cloud")
         return [*map_, "--output", str(out)], f"{out}: holds a recording"
+    if kind.startswith("output into a recording of "):
+        for name in RECORDINGS[kind.split()[-1]]:
+            (out / name).mkdir()
+        return [*map_, "--output", str(out)], f"{out}: holds a recording"
     if kind == "output into the stream":
         return ["map", str(out), "--output", str(out)], f"{out}: holds a recording"
     if kind == "a large seed":
@@ -143,6 +156,7 @@ def case(tmp_path, kind):
         "a result is read-only",
         "a result is a folder",
         "output into a folder of clouds",
+        *(f"output into a recording of {name}" for name in RECORDINGS),
         "output into the stream",
         "a large seed",
         "a large seed of the demo",

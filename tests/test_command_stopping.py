@@ -15,7 +15,7 @@ from hiosdf_jax._src.command.progress import load_map
 from hiosdf_jax._src.command.stopping import Stopping
 
 FRAMES = 20  # frame 15 is held out
-CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 _shuffled = np.random.default_rng(0).permutation(FRAMES).tolist()
 QUICK, LONG = _shuffled[:4], [pytest.param(i, marks=pytest.mark.long) for i in _shuffled[4:]]
 RESULTS = {"metrics.json", "slices.png", "mesh.ply", "mesh.png"}
@@ -101,7 +101,8 @@ def test_a_run_that_is_stopped_twice_without_a_file_of_its_own(
     """With all pictures; the map waits in the folder until the run has come to its end."""
     use_room_config(monkeypatch)
     output = tmp_path / "out"
-    arguments = ["map", str(recording[0]), "--output", str(output), *BOX, "--frames", "12"]
+    first = ["map", "--output", str(output), *BOX, "--frames", "12", "--", str(recording[0])]
+    arguments = first
     for frame in (3, 8):
         with monkeypatch.context() as patch:
             interrupt(patch, frame, lambda: signal.raise_signal(signal.SIGTERM))
@@ -115,7 +116,7 @@ def test_a_run_that_is_stopped_twice_without_a_file_of_its_own(
     assert {path.name for path in output.iterdir()} == RESULTS
     with monkeypatch.context() as patch:
         interrupt(patch, 9, lambda: signal.raise_signal(signal.SIGINT))
-        assert cli.main([*arguments[: arguments.index("--resume")], *BOX]) == 130
+        assert cli.main(first) == 130
     # The configuration is that of the map, without a first reading; the stream may have grown.
     capsys.readouterr()
     longer = ["map", str(recording[0]), "--output", str(output), "--save", str(tmp_path / "map")]
@@ -195,6 +196,37 @@ def test_a_crashed_run_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch, q
     assert cli.main([*arguments, *again]) == 0
     check_equal(saved, recording)
     assert metrics_of(output) == recording[2]
+
+
+def test_a_map_of_another_run_is_kept_aside(tmp_path, monkeypatch, quick, recording, capsys):
+    output, saved = tmp_path / "out", tmp_path / "map.npz"
+    arguments = ["map", str(recording[0]), "--output", str(output), *BOX]
+
+    def stopped_after(frames, *options):
+        with monkeypatch.context() as patch:
+            interrupt(patch, frames - 1, lambda: signal.raise_signal(signal.SIGINT))
+            assert cli.main([*arguments, *options]) == 130
+
+    def frames_of(path):
+        return load_map(path).progress.next_frame
+
+    stopped_after(9)
+    stopped_after(2)
+    text = f"{(output / 'checkpoint.npz').resolve()} is of another run: kept as checkpoint.1.npz"
+    assert text in capsys.readouterr().out
+    assert frames_of(output / "checkpoint.1.npz") == 9
+    stopped_after(4, "--resume", str(output / "checkpoint.npz"))
+    assert frames_of(output / "checkpoint.npz") == 4
+    assert not (output / "checkpoint.2.npz").exists()
+    # A run that goes on with another file leaves this one; only its end replaces --save.
+    resume = ["--resume", str(output / "checkpoint.1.npz"), "--save", str(saved)]
+    saved.write_bytes((output / "checkpoint.npz").read_bytes())
+    stopped_after(12, *resume)
+    assert frames_of(tmp_path / "map.1.npz") == 4 and frames_of(saved) == 12
+    assert cli.main([*arguments, *resume]) == 0
+    check_equal(saved, recording)
+    assert not (tmp_path / "map.2.npz").exists()
+    assert frames_of(output / "checkpoint.npz") == 4
 
 
 def test_a_run_goes_on_behind_a_bad_frame(tmp_path, monkeypatch, quick, capsys):

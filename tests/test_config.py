@@ -1,8 +1,11 @@
 """Every field of the configuration is checked, and the voxel grid follows from the bounds."""
 
+import copy
 import dataclasses
 import math
+import pickle
 
+import numpy as np
 import pytest
 
 import hiosdf_jax as hio
@@ -98,6 +101,17 @@ def test_what_limits_together_forbid():
     hio.Config.paper(((0, 0, 0), (100, 100, 23)))
     with pytest.raises(ValueError, match="no field 'voxelsize'"):
         hio.Config.light(BOUNDS, voxelsize=0.1)
+    with pytest.raises(ValueError, match="no field 'voxelsize'"):
+        hio.Config(BOUNDS, voxelsize=0.1)
+    for flag in (True, np.True_, np.array(True)):
+        with pytest.raises(ValueError, match=r"Config\.bounds has booleans"):
+            hio.Config(((0, 0, 0), (flag, 1, 1)))
+
+
+def test_copies_are_the_same():
+    config = hio.Config.light(BOUNDS, max_range=5.0)
+    assert pickle.loads(pickle.dumps(config)) == copy.deepcopy(config) == config
+    assert dataclasses.replace(config, max_range=6.0) == hio.Config.light(BOUNDS, max_range=6.0)
 
 
 def test_frozen_hashable_and_equal():

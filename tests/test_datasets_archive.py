@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import struct
 import tracemalloc
 import warnings
@@ -225,6 +226,17 @@ def test_a_large_array_needs_a_large_file(tmp_path):
         assert not archive.read("zeros", whole=True).any()
 
 
+def test_all_arrays_together_need_a_large_file(tmp_path):
+    path = tmp_path / "zeros.npz"
+    np.savez_compressed(path, **{name: np.zeros(4_000_000) for name in "abc"})
+    with Archive(path) as archive:
+        assert not archive.read("a").any() and not archive.read("b").any()
+        with pytest.raises(
+            ValueError, match=r"takes 3.2e\+07 bytes, expected at most 3.11e\+06 of"
+        ):
+            archive.read("c")
+
+
 def edited(entries, **changes):
     head = json.loads(str(np.load(io.BytesIO(entries["header.npy"]))))
     config = head["config"] | changes.pop("config", {})
@@ -256,15 +268,17 @@ def test_every_field_of_the_header_is_required(honest, tmp_path):
     ):
         write_entries(path, edited(entries, **changes), zipfile.ZIP_STORED)
         check_refused(honest, "map", path, message)
-    for name in ("grid.color", "../../outside"):
+    for name in ("grid.color", "../../outside", "two\nlines", "\x1b[31mred"):
         write_entries(path, entries | {f"{name}.npy": entry(np.zeros(3))}, zipfile.ZIP_STORED)
-        check_refused(honest, "map", path, f"has the unknown array {name}")
+        shown = name if name.isprintable() else re.escape(repr(name))
+        check_refused(honest, "map", path, f"has the unknown array {shown}")
 
 
 def test_values_that_no_map_has_are_refused(honest, tmp_path):
     _, entries, _, _ = honest["map"]
     path = tmp_path / "map.npz"
     weights = next(name for name in entries if name.startswith("network.params"))
+    second_moment = next(name for name in entries if name.startswith("network.optimizer.0.nu."))
     for name, value, message in (
         (weights, np.nan, "has network.params.* with values that are not finite"),
         ("grid.surface.mean.npy", np.inf, "has grid.surface.mean with values that are not finite"),
@@ -273,6 +287,23 @@ def test_values_that_no_map_has_are_refused(honest, tmp_path):
         ("grid.surface.sdf.npy", 6e4, "has grid.surface.sdf from"),
         ("grid.surface.side.npy", 4, "has grid.surface.side from .* to 4, expected"),
         ("optimism.npy", -1e9, "has optimism from -1000000000.0 to"),
+        ("grid.surface.nearest.npy", 127, "has grid.surface.nearest without a patch there"),
+        ("grid.surface.nearest.npy", 0, "has grid.surface.nearest without a patch there"),
+        ("grid.surface.sdf.npy", -0.5, "has grid.surface.sdf without a patch, expected 1"),
+        ("grid.surface.side.npy", 1, "has grid.surface.sdf without a patch, expected 1"),
+        ("grid.surface.doubt.npy", 100.0, "has grid.surface.doubt beyond 1"),
+        ("grid.surface.frontier.npy", -128, "has grid.surface.frontier from -128 to"),
+        ("grid.surface.frontier.npy", 127, "has grid.surface.frontier of the wrong sign"),
+        ("grid.change.npy", -128, "has grid.change from -128 to"),
+        ("grid.change.npy", 9, "has grid.change from 0 to 9, expected -72 to 8"),
+        ("optimism.npy", 1e30, "has optimism from 1.* to .*, expected 0 to 424"),
+        ("report.refused_in_row.npy", -1, "has report.refused_in_row from -1 to"),
+        ("report.refused_in_row.npy", 2**31 - 1, "has report.refused_in_row from"),
+        ("report.flags.npy", 2**31, "has report.flags from"),
+        ("report.update_flags.npy", 2**31, "has report.update_flags from"),
+        ("report.points_used.npy", -1, "has report.points_used from -1 to"),
+        ("report.sdf_loss.npy", -1.0, "has report.sdf_loss from -1.0 to"),
+        (second_moment, -1.0, "has network.optimizer.0.nu.* from -1.0 to"),
         ("updates.npy", -1, "has updates from -1 to -1, expected 0"),
         (weights, 3e38, "has network.params.* from .* to 3"),
         ("network.origin_world.npy", 3e38, "has network.origin_world from .* to 3"),

@@ -1,6 +1,7 @@
 """Folders of PLY and PCD clouds with a trajectory."""
 
 import os
+import struct
 
 import numpy as np
 import pytest
@@ -49,6 +50,7 @@ def write_poses(path, stamps):
         ([1403636579763555584 + 10**8 * i for i in range(4)], None),
         (["9", "10", "11", "100"], [0.1, 0.2, 0.3, 0.4]),
         (["scan_2", "scan_10", "scan_11", "scan_200"], [0.1, 0.2, 0.3, 0.4]),
+        (["2", "10", "11\u00b2", "200"], [0.1, 0.2, 0.3, 0.4]),  # a digit that is no number
     ],
 )
 def test_folders_of_clouds(tmp_path, names, stamps, suffix):
@@ -162,3 +164,19 @@ def test_a_ply_file_must_hold_what_it_declares_and_opens_no_other(tmp_path):
     os.mkfifo(folder / "pipe.png")
     path.write_bytes(whole.replace(b"format", b"comment TextureFile pipe.png\nformat", 1))
     np.testing.assert_array_equal(open_stream(folder)[1][0], CLOUDS[1])
+
+
+def test_a_compressed_pcd_file_inflates_to_a_limit(tmp_path):
+    folder = write_clouds(tmp_path, range(FRAMES), ".pcd")
+    write_poses(tmp_path / "poses.txt", range(FRAMES))
+    path = folder / "1.pcd"
+    points, values = 200_000, 500
+    path.write_bytes(
+        f"VERSION .7\nFIELDS x y z q\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 {values - 3}\n"
+        f"WIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\n"
+        "DATA binary_compressed\n".encode()
+        + struct.pack("<II", 8, points * values * 4)
+        + bytes(8)
+    )
+    reason = "inflates to 400000000 bytes, expected at most 67108864"
+    check_bad(open_stream(folder), 1, path, "not a readable PCD file", reason)

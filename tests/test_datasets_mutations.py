@@ -17,11 +17,11 @@ def check(first, count):
     assert summary["good"] > count / 10 and summary["refused"] > count / 3
 
 
-def test_damaged_recordings_and_maps():
+def test_damaged_recordings_maps_and_meshes():
     check(0, 400)
 
 
 @pytest.mark.long
-def test_ten_thousand_damaged_recordings_and_maps():
+def test_ten_thousand_damaged_recordings_maps_and_meshes():
     for first in range(400, 12_400, 3_000):
         check(first, 3_000)

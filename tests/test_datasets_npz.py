@@ -225,3 +225,14 @@ def test_recorded_clouds_lie_on_the_exact_surface(name):
     (low, high), _ = find_bounds(stream)
     for points in (truth.points_world, truth.surface_points_world):
         assert ((points > low) & (points < high)).all()
+
+
+def test_a_frame_of_points_has_a_limit_too(tmp_path):
+    many = {
+        "points_mm": np.zeros((2_100_000, 3), np.int16),
+        "offsets": np.array([0, 1, 2, 2_100_000]),
+    }
+    path = tmp_path / "stream.npz"
+    np.savez_compressed(path, **(POINTS | many))
+    with pytest.raises(ValueError, match="points_mm has 2099998 returns in a frame, expected at"):
+        NpzStream(path)

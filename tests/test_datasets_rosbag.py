@@ -1,6 +1,7 @@
 """ROS 1 and ROS 2 bags, written here, against the closed form of the motion in them."""
 
 import re
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from hiosdf_jax.datasets import BadFrameError, find_bounds, open_stream, read_fr
 
 rosbags = pytest.importorskip("rosbags")
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -261,6 +262,38 @@ def test_broken_bags(tmp_path, kind):
         file.write_bytes(broken)
         with pytest.raises(ValueError, match=re.escape(str(path))):
             open_stream(path)
+
+
+def write_zeros(path, kind, count):
+    """A bag whose only cloud has this many returns, all of them zeros, compressed."""
+    bag = Bag(path, kind)
+    if kind == "ros1":
+        bag.writer.set_compression(Writer1.CompressionFormat.BZ2)
+    else:
+        mode = {"sqlite3": "MESSAGE", "file": "FILE", "mcap": "STORAGE"}[kind]
+        mode = CompressionMode[mode]
+        bag.writer.set_compression(mode, CompressionFormat.ZSTD)
+    with bag:
+        for stamp in (START, START + 1):
+            bag.write_odometry(stamp, "odom", "lidar", motion(stamp))
+        bag.write_cloud(START + 0.5, np.broadcast_to(np.float32(0), (count, 3)))
+    return bag.path
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "file", "mcap"])
+def test_compressed_bags_inflate_to_a_limit(tmp_path, kind):
+    stream = open_stream(write_zeros(tmp_path / "small", kind, 1000))
+    assert stream[0][0].shape == (1000, 3)
+    path = write_zeros(tmp_path / "many", kind, 2_200_000)  # returns; 50 MB
+    with pytest.raises(ValueError, match="2200000 returns, expected at most 2097152"):
+        open_stream(path)[0]
+    path = write_zeros(tmp_path / "large", kind, 4_000_000)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=f"{re.escape(str(path))}: not a readable .*inflate"):
+        open_stream(path)[0]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
 
 
 def test_number_types_and_padding_of_points():

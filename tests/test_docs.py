@@ -3,6 +3,7 @@
 import ast
 import importlib
 import importlib.util
+import inspect
 import re
 import shlex
 from pathlib import Path
@@ -172,11 +173,45 @@ def test_names_of_the_package_exist(page):
         assert resolve(dotted)
 
 
-def rows(heading):
-    """The rows of the first table below a heading of the architecture page, as lists of cells."""
-    section = ARCHITECTURE.read_text("utf-8").split(f"## {heading}\n")[1]
+MODULES = [hio, *(getattr(hio, each) for each in ("planning", *hio._MODULES))]
+FUNCTIONS = {
+    f"{module.__name__}.{name}": function
+    for module in MODULES
+    for name in module.__all__
+    if inspect.isfunction(function := inspect.unwrap(getattr(module, name)))
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_public_function_has_an_example(name):
+    text = inspect.getdoc(FUNCTIONS[name]) or ""
+    example = re.search(r"^Example:\n((?:    .*\n?|\n(?=    ))+)", text, re.M)
+    assert example, "it has no example"
+    lines = example[1].splitlines()
+    if any(line.startswith("    >>>") for line in lines):
+        lines = [line for line in lines if re.match(r"    (>>>|\.\.\.)", line)]
+    code = ast.parse("\n".join(re.sub(r"^    ((>>>|\.\.\.) ?)?", "", line) for line in lines))
+    called = {ast.unparse(each.func) for each in ast.walk(code) if isinstance(each, ast.Call)}
+    own = name.split(".")[-1]
+    assert any(each.split(".")[-1] == own for each in called), "its example does not call it"
+    for dotted in called:
+        module, _, attribute = dotted.rpartition(".")
+        if module == "hio" or module in hio._MODULES or module == "planning":
+            assert hasattr(hio if module == "hio" else getattr(hio, module), attribute), dotted
+
+
+def rows(heading, page=ARCHITECTURE):
+    """The rows of the first table below a heading of a page, as lists of cells."""
+    section = page.read_text("utf-8").split(f"## {heading}\n")[1]
     table = re.search(r"^\|.*?\n(?!\|)", section, re.M | re.S)[0]
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+
+
+def test_messages_that_need_help_are_those_of_the_package():
+    files = sorted((ROOT / "hiosdf_jax").rglob("*.py"))
+    source = " ".join(path.read_text("utf-8") for path in files)
+    for message, *_ in rows("What it says", ROOT / "docs" / "troubleshooting.md"):
+        assert message.strip("`") in source, message
 
 
 def test_the_architecture_has_the_stages_in_order():

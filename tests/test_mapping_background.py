@@ -1,5 +1,6 @@
 """Mapping in a thread: the same map, valid fields, and a planner that never waits."""
 
+import contextlib
 import subprocess
 import sys
 import threading
@@ -62,6 +63,40 @@ def test_the_newest_frame_replaces_the_waiting_one(empty_map, monkeypatch):
     assert fused == [0, 5]
     with pytest.raises(RuntimeError, match="is closed"):
         mapper.put(np.zeros((1, 3)), pose)
+
+
+class EndlessSensor:
+    """A map that lies elsewhere, and a sensor that puts a frame whenever something is done."""
+
+    def __init__(self, state):
+        self.state, self.map, self.fault, self.mapper = state, state, None, None
+
+    def put(self):
+        with contextlib.suppress(RuntimeError):  # once the mapper is closed
+            self.mapper.put(np.ones((1, 3)), np.eye(4))
+
+    def fuse(self, frame, _):
+        self.put()
+        self.state = None
+        return fusing.Published(frame.cloud, frame.stamp)
+
+    def fetch(self):
+        self.put()
+        self.state = self.map
+        return self.map
+
+    def stop(self):
+        pass
+
+
+def test_waiting_ends_although_frames_keep_coming(empty_map, monkeypatch):
+    sensor = EndlessSensor(empty_map)
+    monkeypatch.setattr("hiosdf_jax._src.mapping.background.mapper.Fuser", lambda _: sensor)
+    sensor.mapper = mapper = hio.BackgroundMapper(empty_map)
+    sensor.put()
+    for _ in range(20):
+        assert mapper.wait(20.0) is empty_map
+    assert mapper.close() is empty_map
 
 
 def test_a_bad_frame_is_counted_and_mapping_continues(empty_map):

@@ -98,7 +98,17 @@ def test_one_bad_frame_in_ten_leaves_the_nine_others(empty_map):
         mapper.wait()
         assert "center" in str(mapper.rejection)
         assert "in the mapping process" in mapper.rejection.__notes__[0]
-    assert int(mapper.field.updates) == len(BAD_FRAMES)
+        mapper.serve = serving.lock
+        mapper.put(*frame)
+        mapper.wait()
+        assert "serve returned what cannot leave the mapping process" in str(mapper.rejection)
+        mapper.serve = serving.warning
+        mapper.put(*frame)
+        with pytest.warns(UserWarning, match="of serve"):
+            mapper.wait()
+        for _ in range(3):
+            expected = hio.update(expected, *frame)
+    assert int(mapper.field.updates) == len(BAD_FRAMES) + 3
     np.testing.assert_array_equal(hio.sdf(mapper.field, POINTS), hio.sdf(expected, POINTS))
     assert all(reasons) and len(set(reasons)) >= len(reasons) - 2
     assert "flags OUT_OF_RANGE" in reasons[-1]

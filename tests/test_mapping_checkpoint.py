@@ -9,7 +9,10 @@ import pytest
 from room import arrays_equal, stream
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.change import hiding, vanishing
+from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid.distance import recompute_distances
+from hiosdf_jax._src.mapping import stored_values
 
 
 def test_a_loaded_map_continues_bit_by_bit(room_map, tmp_path):
@@ -279,3 +282,34 @@ def test_names_in_a_file_do_not_change(tmp_path):
     assert saved.pop("header") is not None
     assert saved == {name: (array.shape, array.dtype) for name, array in arrays.items()}
     assert written == header
+
+
+def test_a_map_whose_distances_do_not_fit_its_evidence_is_refused(room_map, tmp_path):
+    hio.save(tmp_path / "map.npz", room_map)
+    with np.load(tmp_path / "map.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    for name, value, message in (
+        ("grid.surface.nearest", -128, "sdf without a patch"),
+        ("grid.surface.nearest", 0, "nearest without a patch there"),
+        ("grid.surface.frontier", 127, "frontier of the wrong sign"),
+        ("grid.surface.frontier", -127, "frontier of the wrong sign"),
+        ("grid.hits", 0, "nearest without a patch there"),
+        ("grid.surface.sdf", 20, "sdf without a patch|sdf beyond"),
+    ):
+        changed = np.full_like(arrays[name], value)
+        np.savez(tmp_path / "bad.npz", **(arrays | {name: changed}))
+        with pytest.raises(ValueError, match=rf"bad.npz has grid\.surface\.({message})"):
+            hio.load(tmp_path / "bad.npz")
+
+
+def test_a_loss_that_failed_is_stored(room_map, tmp_path):
+    nothing = jax.numpy.float32(np.nan)
+    state = room_map.replace(report=room_map.report.replace(sdf_loss=nothing))
+    hio.save(tmp_path / "map.npz", state)
+    assert np.isnan(hio.load(tmp_path / "map.npz").report.sdf_loss)
+
+
+def test_the_limits_of_change_are_those_of_the_stages():
+    assert stored_values._LIMITS["grid.change"] == (vanishing._GONE, hiding._NEW_SCANS)
+    most = 127 / blend._LEAST_SCALE_VOXELS  # voxels of distance by the least scale
+    assert most <= stored_values._LIMITS["optimism"][1] < 1.01 * most

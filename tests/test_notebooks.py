@@ -1,6 +1,6 @@
-"""The quickstart runs, and the stored notebook is what its text source gives.
+"""The notebooks run, and each stored notebook is what its text source gives.
 
-python tests/test_notebooks.py    # executes notebooks/quickstart.py and stores the notebook
+python tests/test_notebooks.py    # executes notebooks/*.py and stores the notebooks
 """
 
 import re
@@ -11,11 +11,19 @@ import nbclient
 import pytest
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
-SOURCE, STORED = NOTEBOOKS / "quickstart.py", NOTEBOOKS / "quickstart.ipynb"
+NAMES = ["quickstart", "own_data"]
 
 
-def execute():
-    notebook = jupytext.read(SOURCE)
+def source(name):
+    return NOTEBOOKS / f"{name}.py"
+
+
+def stored_file(name):
+    return NOTEBOOKS / f"{name}.ipynb"
+
+
+def execute(name):
+    notebook = jupytext.read(source(name))
     client = nbclient.NotebookClient(
         notebook,
         timeout=180,
@@ -46,32 +54,55 @@ def without_numbers(text):
 
 @pytest.fixture(scope="module")
 def executed():
-    return execute()
+    """Gives the executed notebook of a name; executes each once."""
+    done = {}
+
+    def get(name):
+        if name not in done:
+            done[name] = execute(name)
+        return done[name]
+
+    return get
 
 
-def test_the_quickstart_runs(executed):
-    assert len(pictures(executed)) == 2
-    error_cm = float(printed(executed).split("mean error on this slice: ")[1].split(" cm")[0])
-    assert error_cm < 10
-    assert not any(output.get("name") == "stderr" for output in outputs(executed))
+@pytest.mark.parametrize(
+    ("name", "count", "error", "most_cm"),
+    [
+        ("quickstart", 2, "mean error on this slice: ", 10),
+        ("own_data", 3, "median distance of held-out returns: ", 3),
+    ],
+)
+def test_a_notebook_runs(executed, name, count, error, most_cm):
+    notebook = executed(name)
+    assert len(pictures(notebook)) == count
+    assert float(printed(notebook).split(error)[1].split(" cm")[0]) < most_cm
+    assert not any(output.get("name") == "stderr" for output in outputs(notebook))
 
 
-def test_the_notebook_is_its_text_source():
-    text, stored = jupytext.read(SOURCE), jupytext.read(STORED)
+def test_every_notebook_is_tested():
+    assert sorted(path.stem for path in NOTEBOOKS.glob("*.py")) == sorted(NAMES)
+    assert sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_notebook_is_its_text_source(name):
+    text, stored = jupytext.read(source(name)), jupytext.read(stored_file(name))
     assert [(cell.cell_type, cell.source) for cell in stored.cells] == [
         (cell.cell_type, cell.source) for cell in text.cells
     ]
 
 
-def test_the_notebook_is_stored_with_its_outputs(executed):
-    stored = jupytext.read(STORED)
-    assert len(pictures(stored)) == len(pictures(executed))
-    assert without_numbers(printed(stored)) == without_numbers(printed(executed))
+@pytest.mark.parametrize("name", NAMES)
+def test_a_notebook_is_stored_with_its_outputs(executed, name):
+    stored = jupytext.read(stored_file(name))
+    assert len(pictures(stored)) == len(pictures(executed(name)))
+    assert without_numbers(printed(stored)) == without_numbers(printed(executed(name)))
 
 
-def test_the_stored_outputs_are_small_and_name_no_machine():
-    stored = jupytext.read(STORED)
-    assert STORED.stat().st_size < 600_000
+@pytest.mark.parametrize("name", NAMES)
+def test_stored_outputs_are_small_and_name_no_machine(name):
+    stored = jupytext.read(stored_file(name))
+    assert stored_file(name).stat().st_size < 600_000
     assert all(output.output_type in ("stream", "display_data") for output in outputs(stored))
     assert not any(output.get("name") == "stderr" for output in outputs(stored))
     assert not re.search(r"/(home|root|tmp|usr|Users)\b", printed(stored))
@@ -79,6 +110,7 @@ def test_the_stored_outputs_are_small_and_name_no_machine():
 
 
 if __name__ == "__main__":
-    notebook = execute()
-    notebook.metadata.pop("language_info", None)  # the version of this machine's Python
-    jupytext.write(notebook, STORED)
+    for name in NAMES:
+        notebook = execute(name)
+        notebook.metadata.pop("language_info", None)  # the version of this machine's Python
+        jupytext.write(notebook, stored_file(name))

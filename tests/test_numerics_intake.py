@@ -2,6 +2,7 @@
 
 import datetime
 import decimal
+import tempfile
 import warnings
 
 import jax
@@ -175,6 +176,28 @@ def call_file(state, draw):
     return hio.load(path)
 
 
+def call_save(state, draw):
+    places = [
+        "map.npz",
+        "map.npz",
+        ".",
+        "none/map.npz",
+        "a\0b",
+        "/dev/full",
+        "x" * 300,
+        "",
+        None,
+        5,
+    ]
+    chosen = draw(_fields(state))
+    with tempfile.TemporaryDirectory() as folder:
+        place = draw(st.sampled_from(places))
+        path = f"{folder}/{place}" if place in places[:4] else place
+        hio.save(path, chosen)
+        assert arrays_equal(hio.load(path), state)
+    assert path == f"{folder}/map.npz" and chosen is state
+
+
 def call_clearance(state, draw):
     function = draw(
         st.sampled_from([planning.sphere_clearance, planning.sphere_clearance_and_grad])
@@ -249,7 +272,7 @@ def check_call(known, data):
             assert str(error)
             answer = None
         except OSError as error:
-            assert call is call_file and error.filename is not None
+            assert call in (call_file, call_save) and error.filename is not None
             answer = None
     if isinstance(answer, hio.MapState):
         answer = answer.replace(report=None, key=None)

@@ -1,5 +1,7 @@
 """A robot as spheres: complete covers that protrude little, placed as MuJoCo places the geoms."""
 
+import threading
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,6 +12,7 @@ from analytic import equalities_with_least, half_space
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco import mjx
+from scipy.spatial import KDTree
 
 from hiosdf_jax import planning
 from hiosdf_jax._src.planning.robot import cover, solids
@@ -250,7 +253,7 @@ def test_the_distance_to_an_ellipsoid_equals_that_to_a_fine_mesh():
     points = np.concatenate(
         [rng.uniform(-0.12, 0.12, (100, 3)), np.zeros((1, 3)), np.diag(EGG) / 2]
     )
-    least, greatest = solids.ellipsoid(EGG)(points)
+    least, greatest = solids.ellipsoid(EGG).distance(points)
     np.testing.assert_array_equal(least, greatest)
     np.testing.assert_allclose(least, distance_to_convex(solid, points), atol=3e-4)
 
@@ -260,13 +263,22 @@ def test_the_bounds_of_the_distance_to_a_mesh_hold():
     vertices, faces = compiled.mesh_vert.astype(float), compiled.mesh_face
     points = np.random.default_rng(2).uniform(-0.2, 0.2, (3000, 3))
     exact = distance_to_convex(trimesh.Trimesh(vertices, faces, process=False), points)
-    least, greatest = solids.mesh(vertices, faces, TOLERANCE)(points)
+    solid = solids.mesh(vertices, faces, TOLERANCE)
+    least, greatest = solid.distance(points)
     assert (least <= exact + 1e-9).all()
     assert (exact <= greatest + 1e-9).all()
     assert (greatest - least).max() < 0.5 * TOLERANCE
+    # The quick bounds are wider far from the surface.
+    least, greatest = solid.quick(points)
+    assert (least <= exact + 1e-9).all()
+    assert (exact <= greatest + 1e-9).all()
+    in_box = np.all((points >= vertices.min(axis=0)) & (points <= vertices.max(axis=0)), axis=1)
+    assert (greatest - least)[in_box].max() < TOLERANCE
+    assert (greatest - least)[np.abs(exact) < TOLERANCE / 16].max() < 0.5 * TOLERANCE
     # Without one face it encloses nothing: no point is inside a sheet.
-    _, greatest = solids.mesh(vertices, faces[1:], TOLERANCE)(points)
-    assert (greatest >= 0).all()
+    sheet = solids.mesh(vertices, faces[1:], TOLERANCE)
+    assert (sheet.distance(points)[1] >= 0).all()
+    assert (sheet.quick(points)[1] >= 0).all()
 
 
 def test_the_hole_of_a_ring_stays_open():
@@ -405,8 +417,82 @@ def test_a_tolerance_that_is_no_length_is_refused(tolerance):
 
 def test_the_time_for_covers_is_limited():
     model = mujoco.MjModel.from_xml_string(TWO_BODIES)
-    with pytest.raises(TimeoutError, match=r"covered 0 of 1 geoms in budget_s = -1 s"):
+    with pytest.raises(TimeoutError, match=r"covered 0 of 1 geoms in budget_s = -1.0 s"):
         planning.spheres_from_model(model, 0.01, bodies=["arm"], budget_s=-1)
+
+
+def test_the_time_for_covers_ends_threads_and_stops_inside_a_mesh(model):
+    with pytest.raises(TimeoutError, match=r"of 5 geoms in budget_s = 0\.01 s"):
+        planning.spheres_from_model(model, 0.01, budget_s=0.01)
+    names = [thread.name for thread in threading.enumerate()]
+    assert not any(name.startswith("ThreadPoolExecutor") for name in names)
+    with pytest.raises(ValueError, match="budget_s"):
+        planning.spheres_from_model(model, TOLERANCE, budget_s="soon")
+
+
+def test_a_cache_serves_the_same_geoms_and_tolerance_alone(model, alone, tmp_path, monkeypatch):
+    path, geoms = tmp_path / "arm.npz", ["bone", "finger"]
+    expected = jax.tree.map(lambda *parts: np.concatenate(parts), *(alone[g] for g in geoms))
+
+    def covered(tolerance=TOLERANCE, chosen=geoms):
+        return planning.spheres_from_model(model, tolerance, geoms=chosen, cache=path)
+
+    jax.tree.map(np.testing.assert_array_equal, covered(), expected)
+    written = path.read_bytes()
+    with monkeypatch.context() as patched:  # read, not covered again
+        patched.setattr("hiosdf_jax._src.planning.robot.spheres.cover_geom", None)
+        jax.tree.map(np.testing.assert_array_equal, covered(), expected)
+        with pytest.raises(TypeError):
+            covered(0.02)
+        with pytest.raises(TypeError):
+            covered(chosen=["bone"])
+    assert path.read_bytes() == written
+    assert len(covered(chosen=["bone"]).radii) == len(alone["bone"].radii)
+    assert path.read_bytes() != written
+
+
+def test_another_file_is_no_cache_and_stays(model, tmp_path):
+    path = tmp_path / "points.npz"
+    np.savez(path, points=np.zeros(3))
+    other = path.read_bytes()
+    with pytest.raises(ValueError, match=r"points\.npz holds no covers"):
+        planning.spheres_from_model(model, TOLERANCE, geoms=["bone"], cache=path)
+    assert path.read_bytes() == other
+    path.write_bytes(b"text")
+    with pytest.raises(ValueError, match=r"points\.npz"):
+        planning.spheres_from_model(model, TOLERANCE, geoms=["bone"], cache=path)
+    with pytest.raises(FileNotFoundError):
+        planning.spheres_from_model(model, TOLERANCE, geoms=["bone"], cache=tmp_path / "no" / "a")
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -0.1, 0.0])
+def test_damaged_covers_are_refused(model, tmp_path, wrong):
+    path = tmp_path / "arm.npz"
+    planning.spheres_from_model(model, TOLERANCE, geoms=["bone"], cache=path)
+    arrays = dict(np.load(path))
+    arrays["radii"][0] = wrong
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match=r"arm\.npz holds covers that are damaged"):
+        planning.spheres_from_model(model, TOLERANCE, geoms=["bone"], cache=path)
+
+
+def test_samples_of_triangles_leave_no_gap():
+    rng = np.random.default_rng(5)
+    # Needles, a point and a segment among them.
+    triangles = rng.uniform(-1, 1, (40, 3, 3)) * np.where(rng.random((40, 1, 1)) < 0.5, 1, 0.02)
+    triangles[:10, 2] = triangles[:10, 0] + 0.01 * rng.uniform(-1, 1, (10, 3))
+    triangles[-1], triangles[-2, 2] = triangles[-1, :1], triangles[-2, 1]
+    samples = solids._on_triangles(triangles, 0.02)
+    weights = rng.dirichlet(np.full(3, 0.5), (40, 500))
+    points = (weights @ triangles).reshape(-1, 3)
+    assert KDTree(samples).query(points)[0].max() <= 0.02
+    # All of them are on their triangles, by areas: those to the corners add up to the whole.
+    counts = [len(solids._on_triangles(t[None], 0.02)) for t in triangles]
+    assert sum(counts) == len(samples)
+    a, b, c = (np.repeat(triangles[:, k], counts, axis=0) - samples for k in range(3))
+    parts = [np.linalg.norm(np.cross(u, v), axis=1) for u, v in ((a, b), (b, c), (c, a))]
+    whole = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    np.testing.assert_allclose(sum(parts), whole, atol=1e-12)
 
 
 def test_poses_before_kinematics_are_refused_and_inside_jit_in_collision():

@@ -1,5 +1,9 @@
 """Exact distances of meshes and grids against closed forms."""
 
+import json
+import struct
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -151,3 +155,88 @@ def test_messages_name_the_bad_scene(tmp_path):
         (tmp_path / "transform.txt").write_text(text)
         with pytest.raises(ValueError, match=message):
             grid_scene(tmp_path)
+
+
+def glb_with_index(index):
+    """A box whose first triangle has this corner."""
+    content = bytearray(trimesh.creation.box((2, 2, 2)).export(file_type="glb"))
+    start = 20 + struct.unpack("<I", content[12:16])[0]
+    header = json.loads(content[20:start])
+    accessor = next(each for each in header["accessors"] if each["type"] == "SCALAR")
+    view = header["bufferViews"][accessor["bufferView"]]
+    struct.pack_into("<I", content, start + 8 + view.get("byteOffset", 0), index)
+    return bytes(content)
+
+
+def glb(**header):
+    """A file without arrays."""
+    text = json.dumps({"asset": {"version": "2.0"}} | header).encode()
+    text += b" " * (-len(text) % 4)
+    sizes = struct.pack("<III", 2, 20 + len(text), len(text))
+    return b"glTF" + sizes + b"JSON" + text
+
+
+def many_nodes(count, **node):
+    accessors = [{"componentType": 5126, "count": 100, "type": "VEC3"}]
+    meshes = [{"primitives": [{"attributes": {"POSITION": 0}}]}]
+    nodes = [{"mesh": 0} | node] * count
+    scenes = [{"nodes": list(range(count))}]
+    return glb(accessors=accessors, meshes=meshes, nodes=nodes, scenes=scenes, scene=0)
+
+
+def ply(vertices, faces=1, gap=" ", before=""):
+    return (
+        f"ply\nformat ascii 1.0\n{before}element{gap}vertex {vertices}\nproperty float x\n"
+        f"property float y\nproperty float z\nelement face {faces}\n"
+        "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n"
+    ).encode()
+
+
+BOX = trimesh.creation.box((2, 2, 2))
+BAD_MESHES = {
+    "large.glb": (glb_with_index(16384), "corners 0 to 16384, expected 0 to 7"),
+    "negative.glb": (glb_with_index(2**32 - 7), "expected 0 to 7"),
+    "array.glb": (glb(accessors=[{"count": 10**9, "type": "VEC3"}]), "declares arrays of"),
+    "copies.glb": (many_nodes(30_000), "3000000 corners, expected at most 2097152"),
+    "parents.glb": (many_nodes(3, children=[0]), "a node has two parents"),
+    "index.ply": (ply(3), "corners 0 to 9, expected 0 to 2"),
+    "vertices.ply": (ply(500_000_000, gap="\t"), "declares 500000000 of vertex"),
+    "faces.ply": (ply(3, 2_000_000_000), "declares 2000000000 of face"),
+    "comments.ply": (ply(3, before="comment\n" * 10_000), "no end of a header"),
+    "flat.obj": (b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", r"corners of shape \(.*, 2\)|shape"),
+    "far.obj": (b"v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n", r"corners 1e\+30 m away"),
+    "endless.obj": (b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+    "index.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n", "index|corners"),
+    "archive.3mf": (b"PK", r"no mesh, expected one of \.ply, .*\.glb$"),
+    "other.gltf": (b"{}", r"no mesh, expected one of \.ply, .*\.glb$"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_MESHES)
+def test_damaged_meshes_are_refused_before_foreign_code_reads_them(tmp_path, name):
+    content, message = BAD_MESHES[name]
+    (tmp_path / name).write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=message) as error:
+        read_scene(tmp_path / name, ORIGIN)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert str(error.value).startswith(str(tmp_path / name)) and "\n" not in str(error.value)
+    assert peak < 50e6
+
+
+@pytest.mark.parametrize("faces", [[[0, 1, 8]], [[0, 1, -1]]])
+def test_triangles_without_corners_are_refused(faces):
+    mesh = trimesh.Trimesh(BOX.vertices, faces, process=False)
+    with pytest.raises(ValueError, match="expected 0 to 7"):
+        mesh_scene(mesh, ORIGIN)
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "stl", "off", "glb", "PLY"])
+def test_meshes_of_any_format_are_the_same(tmp_path, kind):
+    path = tmp_path / f"box.{kind}"
+    path.write_bytes(b"")
+    BOX.export(path, file_type=kind.lower())
+    points = points_in(-2, 2, 200)
+    found = read_scene(path, ORIGIN).sdf_and_grad(points)[0]
+    np.testing.assert_allclose(found, box_sdf(points, np.ones(3)), atol=1e-6)

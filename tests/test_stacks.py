@@ -1,6 +1,64 @@
 """What JAX can be set to and combined with: each row works, or says what to do.
 
 One device suffices: the types of arrays in a mesh do not depend on the number of devices.
+
+What has failed in users' stacks, and the test of it. Those without a file are in this one.
+
+- jax.grad by MapState, Field or Baked
+    test_gradients_by_the_float_leaves_of_a_map
+    test_gradients_by_a_whole_map_need_allow_int
+- derivatives through update
+    test_mapping_gradients.test_the_gradient_equals_finite_differences
+    test_mapping_gradients.test_forward_mode_and_scans_are_traced
+- jax.make_mesh with Explicit axes
+    test_explicit_axes_as_make_mesh_has_them
+    test_gradients_with_explicit_axes
+- shard_map of swept_clearance, update
+    test_shard_map_with_its_checks
+    test_shard_map_of_an_update_and_of_a_trajectory
+- jax.export, symbolic batch, AOT
+    test_export_with_an_open_number_of_points
+    test_export_of_a_whole_map_and_of_named_results
+    test_lowered_and_compiled_ahead_of_time
+- rank and dtype promotion, transfer guard
+    test_strict_promotion
+    test_the_transfer_guard_sees_no_implicit_transfer
+- JAX_ENABLE_X64
+    test_answers_are_float32_with_x64
+- a stacked map without vmap
+    test_a_stack_of_maps_is_refused_with_a_word_on_vmap
+    test_a_stack_of_maps_is_refused_by_update_and_bake
+- clouds of many sizes in jit(update)
+    test_posed_cloud.test_a_padded_cloud_is_what_update_maps
+    test_posed_cloud.test_pad_cloud_refuses_what_update_refuses
+- flax to_bytes, ravel_pytree
+    test_flax_writes_and_reads_a_map
+    test_ravel_takes_the_float_leaves
+- points beyond a baked window
+    test_planning_bound.test_outside_a_window_nothing_is_farther_than_the_window_implies
+- the lower bound in planning
+    test_planning_bound.test_every_clearance_takes_the_bound
+    test_planning_bound.test_lower_grad_equals_finite_differences_where_it_is_smooth
+- BackgroundMapper: bad frames, exceptions, age
+    test_mapping_background.test_a_frame_of_a_wrong_type_is_counted_and_mapping_continues
+    test_mapping_background.test_a_bad_stamp_is_refused_by_put
+    test_mapping_background.test_an_exception_of_the_controller_is_kept
+    test_mapping_background.test_a_failure_can_be_read_without_an_exception
+    test_mapping_background.test_the_age_of_the_field_keeps_its_digits
+- spheres_from_model: time, bare and static bodies
+    test_planning_robot.test_the_time_for_covers_is_limited
+    test_planning_robot.test_a_cache_serves_the_same_geoms_and_tolerance_alone
+    test_planning_robot.test_moving_bodies_of_models_specifications_and_files
+- the wrong kind of map, MjSpec, "1cm"
+    test_the_wrong_kind_of_map_is_named
+    test_planning_robot.test_a_tolerance_that_is_no_length_is_refused
+- planning.mppi, .trajectory
+    test_planning_face.test_adapters_are_attributes_and_can_be_imported_by_name
+- kinematics not run; radii inside jit
+    test_planning_robot.test_poses_before_kinematics_are_refused_and_inside_jit_in_collision
+    test_planning_bound.test_inside_jit_a_radius_that_is_none_is_in_collision
+- MuJoCo 3
+    test_demo_apartment.test_rays_stop_at_the_first_surface
 """
 
 import jax

@@ -113,6 +113,16 @@ def test_private_modules_import_no_public_face():
     assert {name: targets for name, targets in faces.items() if targets} == {}
 
 
+def test_the_list_of_stacks_names_tests_that_exist():
+    folder = Path(__file__).parent
+    head = ast.get_docstring(ast.parse((folder / "test_stacks.py").read_text()))
+    named = [line.strip() for line in head.splitlines() if line.startswith("    test_")]
+    assert len(named) > 20
+    for name in named:
+        file, _, test = name.rpartition(".")
+        assert f"def {test}(" in (folder / f"{file or 'test_stacks'}.py").read_text(), name
+
+
 @pytest.mark.parametrize("where", [PACKAGE, PACKAGE / "_src"], ids=["hiosdf_jax", "_src"])
 def test_few_entries_at_the_top(where):
     entries = {entry.name for entry in where.iterdir()} - {"__init__.py", "__pycache__"}

@@ -6,7 +6,7 @@ import trimesh
 from matplotlib.image import imread
 
 from hiosdf_jax._src.view import shading
-from hiosdf_jax.view import save_shaded
+from hiosdf_jax.pictures import save_shaded
 
 
 def brute_force(corners, width, height):
@@ -136,5 +136,5 @@ def test_small_pieces_near_the_top_are_remains_of_a_ceiling():
     vertices = np.concatenate(pieces)
     faces = np.array([[4 * k, 4 * k + i, 4 * k + i + 1] for k in range(4) for i in (1, 2)])
     area = np.repeat([50.0, 0.5, 0.5, 12.5], 2)
-    remains = shading._remains_of_ceiling(vertices[:, 2], faces, area)
+    remains = shading.remains_of_ceiling(vertices[:, 2], faces, area)
     assert remains.tolist() == [False] * 2 + [True] * 2 + [False] * 4

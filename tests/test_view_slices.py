@@ -6,7 +6,7 @@ from matplotlib import colormaps
 from matplotlib.image import imread
 
 from hiosdf_jax._src.view import slices
-from hiosdf_jax.view import save_slices
+from hiosdf_jax.pictures import save_slices
 
 BOUNDS = ((-2.0, -1.0, 0.0), (2.0, 1.0, 1.0))
 
@@ -43,7 +43,7 @@ def test_queries_have_one_shape_and_the_given_heights(tmp_path):
         return disk(points)
 
     save_slices(tmp_path / "a.png", sdf, None, BOUNDS, [0.25, 0.75])
-    assert {points.shape for points in asked} == {(slices._CHUNK, 3)}
+    assert {points.shape for points in asked} == {(slices.CHUNK, 3)}
     points = np.concatenate(asked)
     assert set(points[:, 2].tolist()) == {0.25, 0.75}
     for axis in (0, 1):

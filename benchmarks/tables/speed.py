@@ -102,8 +102,27 @@ def ratios() -> str:
     return lay_out(["`Config.light`, one H200, medians", "ratio"], cells)
 
 
+def many() -> str:
+    """Points one by one, and many small maps, on one GPU."""
+    record = records.read(records.RESULTS / "fleet_h200.json")
+    cells = []
+    for count in ("102,400", "1,048,576"):
+        for function in ("sdf", "value_and_grad(sdf)"):
+            name = f"vmap({function}) of {count}, default"
+            row, beside = (_number(found(record, name), "median") for found in (_row, _beside))
+            cells.append([f"`vmap({function})` of {count} points, `Config.default`", row, beside])
+    maps = "1,024 maps of 4 x 4 x 2 m"
+    for label, name in (
+        (f"an update of {maps}", f"update of {maps}"),
+        ("256 distances in each of them", f"256 distances in each of {maps}"),
+    ):
+        cells.append([label, _number(_row(record, name), "median"), ""])
+    return lay_out(["one H200, ms", "median", "as one batch"], cells)
+
+
 TABLES = {
     "speed-gpu": gpu,
+    "speed-many": many,
     "speed-cpu": cpu,
     "speed-stages": stages,
     "speed-ratios": ratios,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
-from typing import Any
+from typing import Any, Self
 
 from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
@@ -150,6 +150,13 @@ class Config:
     weight_average: float = _number(0.9, 0.0, 0.999)
     grid_share: float = _number(0.9, 0.0, 1.0)
 
+    def __new__(cls, *_: Any, **fields: Any) -> Self:
+        """Refuses unknown fields by a ValueError, as all other wrong arguments."""
+        unknown = sorted(set(fields) - set(cls.__dataclass_fields__))
+        if unknown:
+            raise ValueError(f"Config has no field {unknown[0]!r}")
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", _checked_bounds(self.bounds))
         noise = self.range_noise
@@ -236,7 +243,7 @@ class Config:
         Raises:
             ValueError: A value is out of range; the message names field, value and limits.
         """
-        return cls(**_known({"bounds": bounds} | overrides))
+        return cls(bounds, **overrides)
 
     @classmethod
     def paper(cls, bounds: Any, **overrides: Any) -> Config:
@@ -252,7 +259,7 @@ class Config:
         Raises:
             ValueError: A value is out of range; the message names field, value and limits.
         """
-        return cls(**_known(_PAPER | {"bounds": bounds} | overrides))
+        return cls(bounds, **(_PAPER | overrides))
 
     @classmethod
     def light(cls, bounds: Any, **overrides: Any) -> Config:
@@ -268,7 +275,7 @@ class Config:
         Raises:
             ValueError: A value is out of range; the message names field, value and limits.
         """
-        return cls(**_known(_LIGHT | {"bounds": bounds} | overrides))
+        return cls(bounds, **(_LIGHT | overrides))
 
     @property
     def corner_index(self) -> tuple[int, int, int]:
@@ -326,13 +333,6 @@ _LIGHT: dict[str, Any] = {
     "warmup_epochs": 5,
     "weight_average": 0.8,
 }
-
-
-def _known(values: dict[str, Any]) -> dict[str, Any]:
-    unknown = sorted(set(values) - set(Config.__dataclass_fields__))
-    if unknown:
-        raise ValueError(f"Config has no field {unknown[0]!r}")
-    return values
 
 
 def _checked_bounds(bounds: Any) -> Bounds:

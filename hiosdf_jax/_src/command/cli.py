@@ -1,13 +1,16 @@
-"""The `hiosdf` command: `hiosdf demo`, `hiosdf map STREAM`."""
+"""The `hiosdf` command: `hiosdf demo | map | eval | view | export | info`."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import itertools
 import math
 import os
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +23,7 @@ from hiosdf_jax._src.output_files import check_output, check_output_folder, repl
 if TYPE_CHECKING:
     import numpy as np
 
+    from hiosdf_jax._src.command.live_map import LiveMap
     from hiosdf_jax._src.command.progress import SavedMap
     from hiosdf_jax._src.command.tracker import Tracker
     from hiosdf_jax._src.config import Config
@@ -29,6 +33,7 @@ if TYPE_CHECKING:
 _NOTHING_MAPPED, _NOT_REACHED, _BAD_INPUT = 1, 1, 2  # exit codes; argparse itself exits with 2
 _OUTPUT = Path("hiosdf_output")
 _DEMO_FRAMES, _MOST_DEMO_FRAMES = 80, 100_000
+_MOST_PORT = 65535
 _MOST_SEED = 2**32 - 1  # JAX drops higher bits
 _PLAN_RESULTS = ("plan.png", "plan.gif", "metrics.json")
 _SKIP_HINT = " (--skip-bad-frames skips such frames)"
@@ -38,7 +43,12 @@ examples:
   hiosdf demo                           map a simulated apartment, score the map and draw it
   hiosdf demo --plan                    let a robot explore the apartment
   hiosdf map house_depth.npz            map a recorded stream, score the map and draw it
+  hiosdf map house_depth.npz --view     the same, in a browser while the map grows
+  hiosdf eval map.npz house_depth.npz   score a saved map against exact distances
   hiosdf map --help                     streams, ground truth, and what else a run can do
+  hiosdf view map.npz                   show a saved map in a browser
+  hiosdf export map.npz --to map.vti    write it for ParaView, ROS, Blender, numpy
+  hiosdf info map.npz                   what a saved map is, in plain words
 """
 _DEMO_EXAMPLES = """\
 examples:
@@ -46,9 +56,9 @@ examples:
   hiosdf demo --config paper --seed 1   with the numbers of the paper
   hiosdf demo --plan --seed 3           a robot drives from one room to another
 
-The folder gets metrics.json, slices.png, mesh.ply and mesh.png; with --plan it gets metrics.json,
-plan.png and plan.gif. Ctrl-C ends the mapping as it does with hiosdf map; with --plan it ends the
-run at once, and nothing is written.
+The folder gets metrics.json, slices.png, mesh.ply, mesh.png and growing.gif, which shows the map
+grow; with --plan it gets metrics.json, plan.png and plan.gif. Ctrl-C ends the mapping as it does
+with hiosdf map; with --plan it ends the run at once, and nothing is written.
 """
 _MAP_EXAMPLES = """\
 examples:
@@ -72,10 +82,43 @@ The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scor
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
 every tenth frame, which it is not given.
 
-A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C) and SIGTERM end it after the current
-frame with exit code 130 and 143; a second one ends it at once. In each case the map so far is
-scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on with
-it.
+A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it after the
+current frame with exit code 130, 143 and 129; a second one ends it at once. In each case the map so
+far is scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on
+with it.
+"""
+
+_VIEW_EXAMPLES = """\
+examples:
+  hiosdf view map.npz                        until Ctrl-C, at http://127.0.0.1:8080
+  hiosdf view map.npz --export scene.html    one file that needs no server, and no view
+  hiosdf view map.npz --host 0.0.0.0         other machines can connect, without a password
+
+The map is what --save of hiosdf map, or hio.save, has written. The view needs the extra view: in a
+clone, pip install '.[view]'.
+"""
+
+_EXPORT_EXAMPLES = """\
+examples:
+  hiosdf export map.npz --to map.vti --resolution 0.1
+      the field for ParaView; .npz has the same for numpy
+  hiosdf export map.npz --to floor.yaml --floor 0 --height 1.2 --radius 0.3
+      a costmap for ROS navigation: floor.yaml and floor.pgm
+  hiosdf export map.npz --to map.glb
+      the mesh for Blender and browsers; .ply has it in the world frame
+  hiosdf export map.npz --to map.safetensors
+      the weights of the network
+  hiosdf export map.npz --to scene.html
+      the view in one file
+  hiosdf export hiosdf_output/demo/metrics.json --to metrics.csv
+      the metrics of a run, for a spreadsheet
+"""
+
+_EVAL_EXAMPLES = """\
+examples:
+  hiosdf eval map.npz house_depth.npz                        the exact distances of the stream
+  hiosdf eval map.npz scans/ --ground-truth house.ply        a mesh of the scene
+  hiosdf eval map.npz house_depth.npz --to metrics.json      and as JSON
 """
 
 
@@ -139,11 +182,11 @@ def _check_console(out: Any) -> None:
 
 def _check_numbers(options: argparse.Namespace) -> None:
     """Raises a failure for numbers too large to count with."""
-    most = {"seed": _MOST_SEED}
+    most = {"seed": _MOST_SEED, "port": _MOST_PORT}
     if options.command is _demo:
         most["frames"] = _MOST_DEMO_FRAMES
     for name, limit in most.items():
-        value = getattr(options, name)
+        value = getattr(options, name, None)
         if value is not None and value > limit:
             raise _Failure(f"--{name} is {value}, expected at most {limit}", _BAD_INPUT)
 
@@ -182,21 +225,25 @@ def _demo(options: argparse.Namespace) -> None:
         truth=apartment.sample_truth(stream),
         exact_sdf=lambda points_world: signed_distance(stream.model, points_world)[0],
         resumed=resumed,
+        draw_growing=True,
     )
 
 
 def _plan(options: argparse.Namespace) -> None:
-    for name in ("frames", "config", "save", "checkpoint_every", "resume"):
-        if getattr(options, name) is not None:
+    for name in ("frames", "config", "save", "checkpoint_every", "resume", "view", "export"):
+        if getattr(options, name):
             raise _Failure(f"{_option(name)} cannot be combined with --plan", _BAD_INPUT)
     output = options.output or _OUTPUT / "demo_plan"
     _check_folder(options, output, _PLAN_RESULTS)
     try:
+        importlib.import_module("skimage.graph")  # the search for paths needs it later
         from hiosdf_jax._src.demo import exploration, picture
     except ModuleNotFoundError as error:
-        if error.name != "jax_mppi":
+        packages = {"jax_mppi": "jax-mppi", "skimage": "scikit-image"}
+        package = packages.get((error.name or "").partition(".")[0])
+        if package is None:
             raise
-        hint = "--plan needs jax-mppi: in a clone, pip install '.[plan]'"
+        hint = f"--plan needs {package}: in a clone, pip install '.[plan]'"
         raise _Failure(hint, _BAD_INPUT) from error
 
     _begin("a robot explores an apartment that it does not know")
@@ -270,11 +317,112 @@ def _tracker(options: argparse.Namespace) -> Tracker | None:
     return Tracker(options.odometry)
 
 
+def _view(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.mapping.pipeline import snapshot
+    from hiosdf_jax._src.view.live import Viewer
+
+    if options.export is not None:
+        _checked(lambda: check_output(options.export))
+    state = _checked(lambda: load(options.map))
+    port = 0 if options.export is not None else options.port
+    viewer = _checked(lambda: Viewer(host=options.host, port=port))
+    viewer.show(snapshot(state))
+    if options.export is not None:
+        _checked(lambda: viewer.export(options.export))
+        print(f"wrote {options.export}")
+    else:
+        _wait(options, viewer.url)
+    viewer.close()
+
+
+def _wait(options: argparse.Namespace, url: str) -> None:
+    """Lets a view live until a signal; Ctrl-C is its usual end."""
+    options.stopping.in_order()
+    print(f"the view is at {url} until Ctrl-C", flush=True)
+    while options.stopping.received is None:
+        time.sleep(0.1)
+    if options.stopping.received == signal.SIGINT:
+        options.stopping.received = None
+
+
+def _export(options: argparse.Namespace) -> None:
+    _checked(lambda: check_output(options.to))
+    if options.to.is_file() and _is_map(options.to):
+        raise _Failure(f"--to {options.to} would replace a map", _BAD_INPUT)
+    if options.to.suffix == ".csv":
+        _export_metrics(options.map, options.to)
+    else:
+        _export_map(options)
+    print(f"wrote {options.to}")
+
+
+def _export_map(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.view.exports.by_suffix import COSTMAPS, check_suffix, export_map
+
+    suffix = _checked(lambda: check_suffix(options.to))
+    names = ("floor", "height", "radius", "step")
+    robot = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if suffix in COSTMAPS and not {"floor", "height", "radius"} <= robot.keys():
+        raise _Failure("a costmap needs --floor, --height and --radius", _BAD_INPUT)
+    if suffix not in COSTMAPS and robot:
+        raise _Failure(f"--{next(iter(robot))} is for {' and '.join(COSTMAPS)}", _BAD_INPUT)
+    state = _checked(lambda: load(options.map))
+    robot = {f"{name}_m": value for name, value in robot.items()}
+    _checked(lambda: export_map(options.to, state, options.resolution, **robot))
+
+
+def _export_metrics(source: Path, target: Path) -> None:
+    import json
+
+    from hiosdf_jax._src.scoring.rows import write_csv
+
+    text = _checked(source.read_bytes)
+    try:
+        metrics = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _Failure(f"{source}: expected the metrics.json of a run", _BAD_INPUT) from error
+    _checked(lambda: write_csv(target, metrics))
+
+
+def _eval(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.command.map_scores import score_map
+    from hiosdf_jax._src.command.report import write_json
+    from hiosdf_jax._src.mapping.checkpoint import load
+    from hiosdf_jax._src.scoring import table
+
+    if options.to is not None:
+        _checked(lambda: check_output(options.to))
+    state = _checked(lambda: load(options.map))
+    stream, truth = _open(options)
+    if options.ground_truth is not None:
+        truth, _ = _sample_truth(options.ground_truth, stream, state.config.max_range)
+    if truth is None:
+        reason = "has no exact distances, expected --ground-truth"
+        raise _Failure(f"{options.stream} {reason}", _BAD_INPUT)
+    scores = _checked(lambda: score_map(options.map, state, truth))
+    print(f"{table.format_table(scores['scores'])}\n\n{table.format_bands(scores['bands'])}")
+    if options.to is not None:
+        write_json(options.to, scores)
+        print(f"\nwrote {options.to}")
+
+
+def _info(options: argparse.Namespace) -> None:
+    from hiosdf_jax._src.command.map_info import describe_map
+    from hiosdf_jax._src.mapping.checkpoint import load
+
+    state = _checked(lambda: load(options.map))
+    print(_checked(lambda: describe_map(options.map, state)))
+
+
 def _check_outputs(options: argparse.Namespace, output: Path) -> None:
     """Raises a failure for outputs that cannot be written, before any work."""
     from hiosdf_jax._src.command.map_stream import RESULTS, UNFINISHED
 
     _check_folder(options, output, (*RESULTS, UNFINISHED))
+    if options.export is not None:
+        _checked(lambda: check_output(options.export))
     if options.save is None:
         return
     _checked(lambda: check_output(options.save))
@@ -297,9 +445,11 @@ def _check_folder(options: argparse.Namespace, output: Path, names: Sequence[str
     _checked(lambda: check_output_folder(output, names))
     if not output.is_dir():
         return
+    from hiosdf_jax._src.datasets.open import holds_recording
+
     stream = getattr(options, "stream", None)
-    clouds = {each.name for each in output.iterdir() if each.suffix in (".ply", ".pcd")}
-    if clouds - {"mesh.ply"} or (stream and output.resolve() == stream.resolve()):
+    is_stream = stream and output.resolve() == stream.resolve()
+    if is_stream or _checked(lambda: holds_recording(output, apart=["mesh.ply"])):
         raise _Failure(f"{output}: holds a recording, expected a folder for results", _BAD_INPUT)
 
 
@@ -340,7 +490,7 @@ def _open(options: argparse.Namespace) -> tuple[Stream, GroundTruth | None]:
     from hiosdf_jax._src.datasets.stream import FrameStream
 
     names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
-    chosen = {name: getattr(options, name) for name in names}
+    chosen = {name: getattr(options, name, None) for name in names}
     chosen = {name: value for name, value in chosen.items() if value is not None}
     stream = _checked(lambda: open_stream(options.stream, options.format, **chosen))
     truth = None
@@ -422,6 +572,7 @@ def _run(
     if resumed is not None and resumed.held_out != (truth is None):
         was = "without" if resumed.held_out else "with"
         raise _Failure(f"{options.resume} was mapped {was} exact distances", _BAD_INPUT)
+    live = _watch(options, stream, settings["exact_sdf"], output)
     options.stopping.in_order()
     try:
         map_stream.run_stream(
@@ -430,9 +581,11 @@ def _run(
             output,
             truth=truth,
             resumed=resumed,
+            resume_path=options.resume,
             save_path=options.save,
             checkpoint_every=options.checkpoint_every,
             stop=lambda: options.stopping.received and options.stopping.received.name,
+            live=live,
             **settings,
         )
     except BadFrameError as error:
@@ -446,19 +599,52 @@ def _run(
             raise KeyboardInterrupt from stop
         if settings.get("tracker") is not None:
             print(f"stopped by {stop}")
-            return
-        map_path = str(map_stream.map_file(output, options.save))
-        again = shlex.join(["hiosdf", *_without_resume(options.arguments), "--resume", map_path])
-        print(f"stopped by {stop}; to go on:\n  {again}")
+        else:
+            map_path = str(map_stream.map_file(output, options.save))
+            command, *rest = _without_resume(options.arguments)
+            again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
+            print(f"stopped by {stop}; to go on:\n  {again}")
+    if live is not None:
+        _end_watch(options, live)
+
+
+def _watch(
+    options: argparse.Namespace,
+    stream: Stream,
+    exact_sdf: Callable[[np.ndarray], np.ndarray] | None,
+    output: Path,
+) -> LiveMap | None:
+    """Starts the view of a growing map, if there is to be one."""
+    if not options.view and options.export is None:
+        return None
+    from hiosdf_jax._src.command.live_map import LiveMap
+
+    port = options.port if options.view else 0
+    button = options.export or output / "scene.html"
+    live = _checked(lambda: LiveMap(stream, exact_sdf, options.host, port, button))
+    if options.view:
+        print(f"the map grows at {live.url}", flush=True)
+    return live
+
+
+def _end_watch(options: argparse.Namespace, live: LiveMap) -> None:
+    """Writes the view if it is to be written, and lets it live on if it is watched."""
+    if options.export is not None:
+        _checked(lambda: live.export(options.export))
+        print(f"wrote {options.export}")
+    if options.view and options.stopping.received is None:
+        _wait(options, live.url)
+    live.close()
 
 
 def _without_resume(arguments: Sequence[str]) -> list[str]:
     """The arguments without the option --resume and its value."""
     kept = []
-    for argument, before in zip(arguments, ["", *arguments], strict=False):
+    names = itertools.takewhile(lambda argument: argument != "--", arguments)
+    for argument, before in zip(names, ["", *arguments], strict=False):
         if "--resume" not in (argument, before) and not argument.startswith("--resume="):
             kept.append(argument)
-    return kept
+    return kept + list(itertools.dropwhile(lambda argument: argument != "--", arguments))
 
 
 def _checked[Result](call: Callable[[], Result], code: int = _BAD_INPUT) -> Result:
@@ -516,10 +702,33 @@ def _parser() -> argparse.ArgumentParser:
         help="go on with the map that a run of the same stream has written; its configuration, "
         "bounds and seed are used",
     )
+    common.add_argument(
+        "--view",
+        action="store_true",
+        help="show the map in a browser while it grows, and on until Ctrl-C; needs viser",
+    )
+    served = argparse.ArgumentParser(add_help=False)
+    served.add_argument(
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help="write the view as one HTML file that needs no server; needs viser",
+    )
+    served.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address of the view (default: 127.0.0.1, which only this machine can reach)",
+    )
+    served.add_argument(
+        "--port",
+        type=_whole(0),
+        default=8080,
+        help="port of the view; the next free one is taken (default: 8080)",
+    )
 
     demo = commands.add_parser(
         "demo",
-        parents=[common],
+        parents=[common, served],
         help="map a simulated apartment and score the map",
         description="Map a simulated, furnished apartment, score the map against exact distances\n"
         "and draw it. Or, with --plan, let a robot explore it.",
@@ -542,13 +751,13 @@ def _parser() -> argparse.ArgumentParser:
         "--plan",
         action="store_true",
         help="let a robot drive to another room, knowing only its own map; --seed also chooses "
-        "start and goal; needs jax-mppi",
+        "start and goal; needs the extra [plan]",
     )
     demo.set_defaults(command=_demo)
 
     map_ = commands.add_parser(
         "map",
-        parents=[common],
+        parents=[common, served],
         help="map a recorded stream and score the map",
         description="Map a recorded stream of posed clouds, score the map and draw it.",
         epilog=_MAP_EXAMPLES,
@@ -571,7 +780,8 @@ def _parser() -> argparse.ArgumentParser:
         "--ground-truth",
         type=Path,
         metavar="FILE",
-        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        help="score against the scene: a triangle mesh (.ply, .obj, .stl, .off or .glb) in the "
+        "stream's world frame and in meters, "
         "or a folder with iSDF's sdf.npy and transform.txt",
     )
 
@@ -639,6 +849,73 @@ def _parser() -> argparse.ArgumentParser:
         help="rosbag: frame of the map (default: the root of the tf tree)",
     )
     map_.set_defaults(command=_map)
+
+    view = commands.add_parser(
+        "view",
+        parents=[served],
+        help="show a saved map in a browser",
+        description="Show a saved map in a browser, in three dimensions.",
+        epilog=_VIEW_EXAMPLES,
+        formatter_class=help_style,
+    )
+    view.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    view.set_defaults(command=_view)
+
+    export = commands.add_parser(
+        "export",
+        help="write a saved map as a file of another program",
+        description="Write a saved map as a file of another program, by the suffix of its name.",
+        epilog=_EXPORT_EXAMPLES,
+        formatter_class=help_style,
+    )
+    export.add_argument(
+        "map", type=Path, metavar="MAP", help="the file of a map; for .csv, that of the metrics"
+    )
+    export.add_argument("--to", type=Path, required=True, metavar="FILE", help="the file to write")
+    export.add_argument(
+        "--resolution",
+        type=float,
+        default=0.05,
+        metavar="M",
+        help="spacing of the samples, edge of a cell or of a triangle, m (default: 0.05)",
+    )
+    robot = export.add_argument_group("costmap")
+    for name, text in {
+        "floor": "height of the floor, m, world frame",
+        "height": "height of the robot, m",
+        "radius": "radius of the robot, m",
+        "step": "what is lower above the floor is no obstacle, m (default: 0.1)",
+    }.items():
+        robot.add_argument(f"--{name}", type=float, metavar="M", help=text)
+    export.set_defaults(command=_export)
+
+    eval_ = commands.add_parser(
+        "eval",
+        help="score a saved map against exact distances",
+        description="Score a saved map against exact distances, where its stream has observed the\n"
+        "scene: those of an .npz stream (eval_*), or a mesh.",
+        epilog=_EVAL_EXAMPLES,
+        formatter_class=help_style,
+    )
+    eval_.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    eval_.add_argument("stream", type=Path, metavar="STREAM", help="the stream that it was made of")
+    eval_.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="FILE",
+        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        "or a folder with iSDF's sdf.npy and transform.txt",
+    )
+    eval_.add_argument("--to", type=Path, metavar="FILE", help="write the scores as JSON, too")
+    eval_.set_defaults(command=_eval, format=None, frames=None)
+
+    info = commands.add_parser(
+        "info",
+        help="what a saved map is, in plain words",
+        description="Describe a saved map: its extent, updates, memory, problems, configuration.",
+    )
+    info.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    info.set_defaults(command=_info)
     return parser
 
 

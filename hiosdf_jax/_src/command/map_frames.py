@@ -78,6 +78,7 @@ def fuse_frames(
     keep_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
     tracker: Tracker | None = None,
+    watch: Callable[[MapState, Progress, np.ndarray, np.ndarray], None] | None = None,
 ) -> Mapped:
     """Fuses the frames of a stream into a map, one by one, with a progress bar.
 
@@ -97,6 +98,8 @@ def fuse_frames(
         stop: Is asked before each frame. The mapping ends if it returns something true, whose `str`
             is the reason.
         tracker: Refines the poses. By default they are used as the stream gives them.
+        watch: Is given the map after each frame, how far it has come, and the frame: its cloud
+            (N, 3) m, sensor frame, and its pose (4, 4) T_world_sensor.
 
     Returns:
         The map and how it was made.
@@ -169,7 +172,7 @@ def fuse_frames(
                 state, pose = tracker.fuse(state, cloud, pose, i)
             jax.block_until_ready(state)
         path_world.append(pose[:3, 3])
-        ups_world.append(_up_of_frame(cloud, pose))
+        ups_world.append(up_of_frame(cloud, pose))
         if i < first:
             continue
         seconds.append(time.perf_counter() - start)
@@ -180,6 +183,8 @@ def fuse_frames(
             points_outside += int(state.report.points_outside)
         if keep is not None and keep_every and len(seconds) % keep_every == 0:
             keep(state, progress(i + 1))
+        if watch is not None:
+            watch(state, progress(i + 1), cloud, pose)
         if i % 5 == 0:
             loss_cm = 100 * float(state.report.sdf_loss)
             bar.set_postfix_str(
@@ -217,11 +222,18 @@ def return_freed_memory() -> None:
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
-def _up_of_frame(cloud: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """The direction against gravity for a sensor that is carried upright, (3,), world frame.
+def up_of_frame(cloud: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Guesses the direction against gravity from a sensor that is carried upright.
 
     A camera sees only what lies in front of it, along z, and its y points down. A LiDAR sees all
     around, and its z points up.
+
+    Args:
+        cloud: (N, 3) m, sensor frame.
+        pose: (4, 4) T_world_sensor.
+
+    Returns:
+        (3,) unit vector, world frame.
     """
     heights = cloud[np.isfinite(cloud).all(axis=-1), 2]
     return -pose[:3, 1] if (heights > 0).all() else pose[:3, 2]

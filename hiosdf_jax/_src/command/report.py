@@ -17,7 +17,7 @@ from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.scoring import table
 from hiosdf_jax._src.state import Flag
 
-_FLAG_WORDS = {
+FLAG_WORDS = {
     Flag.BAD_POSE: "a pose was not finite or not rigid",
     Flag.EMPTY_CLOUD: "a cloud had no return",
     Flag.POINTS_OUTSIDE: "points in range fell outside the bounds and left no surface",
@@ -80,7 +80,7 @@ def summarize(metrics: dict[str, Any]) -> str:
     if metrics["stopped_by"]:
         lines.append(f"ended early by {metrics['stopped_by']}")
     for flag in metrics["flags"]:
-        words = _FLAG_WORDS[Flag[flag]]
+        words = FLAG_WORDS[Flag[flag]]
         if flag == Flag.POINTS_OUTSIDE.name:
             outside = metrics["points_outside"]
             words += f" ({outside} of {outside + metrics['points_used']})"

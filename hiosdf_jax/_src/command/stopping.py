@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: the first one ends a run in order, the second one at once."""
+"""SIGINT, SIGTERM and SIGHUP: the first one ends a run in order, the second one at once."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import threading
 from types import FrameType
 from typing import Any
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one of a closed terminal
 
 
 class Stopping:
-    """Receives SIGINT and SIGTERM while a command runs.
+    """Receives SIGINT, SIGTERM and SIGHUP while a command runs.
 
     Before `in_order` is called, a signal raises KeyboardInterrupt. Afterward the first one is only
     noted in `received`, and the run ends when it can. The second one always has its default effect:
-    it ends the process. A signal that the process ignores, such as SIGINT under `nohup`, stays
+    it ends the process. A signal that the process ignores, such as SIGHUP under `nohup`, stays
     ignored.
 
     Attributes:

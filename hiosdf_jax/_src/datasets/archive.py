@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hiosdf_jax._src.datasets.files import open_regular, parsing
+from hiosdf_jax._src.datasets.inflating import most_inflated
 
 _Path = str | os.PathLike[str]
 
@@ -24,11 +25,6 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 1  # bit of an entry's flags
 _HEADER_BYTES = 10_000 + 12  # numpy's own limit, with magic and length
 _CHUNK_BYTES = 1 << 20
-
-# An array of unknown size may inflate to this many times the size of the file. Recordings of depth
-# cameras and LiDARs shrink to a tenth or more.
-_MOST_INFLATION = 100
-_SMALL_BYTES = 64 << 20  # always allowed
 
 
 class Array(NamedTuple):
@@ -64,6 +60,7 @@ class Archive:
         """
         self.path = path
         self._file = open_regular(path)
+        self._most = self._left = most_inflated(os.fstat(self._file.fileno()).st_size)
         try:
             with parsing(path, "npz file"):
                 if self._file.read(6) == b"\x93NUMPY":
@@ -116,8 +113,8 @@ class Archive:
 
         Args:
             name: Its name.
-            whole: Read it whatever its size, which the caller has checked. Otherwise it must not be
-                larger than 64 MB and 100 times the size of the file.
+            whole: Read it whatever its size, which the caller has checked. Otherwise all arrays
+                that are read must together not be larger than `most_inflated` allows.
 
         Returns:
             The array.
@@ -129,11 +126,13 @@ class Archive:
         with self._reading(name):
             array, file, data = self._open(name)
             count, size = math.prod(array.shape), math.prod(array.shape) * array.dtype.itemsize
-            if not whole and size > self._allowed():
-                raise ValueError(
-                    f"{array.dtype} {array.shape} takes {size:.3g} bytes, expected at most "
-                    f"{self._allowed():.3g} in a file of this size"
-                )
+            if not whole:
+                if size > self._left:
+                    raise ValueError(
+                        f"{array.dtype} {array.shape} takes {size:.3g} bytes, expected at most "
+                        f"{self._left:.3g} of the {self._most:.3g} for a file of this size"
+                    )
+                self._left -= size
             values = np.empty(count, array.dtype)
             target = memoryview(values.view(np.uint8))
             target[: len(data)] = data
@@ -172,9 +171,6 @@ class Archive:
                 f"{entry.file_size - array.start}"
             )
         return array, file, first[array.start :]
-
-    def _allowed(self) -> int:
-        return max(_SMALL_BYTES, _MOST_INFLATION * os.fstat(self._file.fileno()).st_size)
 
     def _reading(self, name: str) -> AbstractContextManager[None]:
         return parsing(f"{self.path}: key {name!r}", "array")

@@ -16,14 +16,17 @@ import struct
 from collections.abc import Callable
 from io import BufferedReader
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
+from hiosdf_jax._src.datasets.inflating import most_inflated
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses
 
 _MAX_GAP = 0.2  # s
+_PLY_HEADER_BYTES = 1 << 16
 _PCD_LINES = 10  # of a header
 _PCD_VALUES = 1000  # per point
 _NANOSECONDS = 1e17  # times from here on are in nanoseconds
@@ -46,6 +49,10 @@ def cloud_stream(
         FileNotFoundError: A file or folder is missing.
         ValueError: The trajectory is malformed, missing, or does not fit the clouds.
         ModuleNotFoundError: There are .pcd files and pypcd4 is not installed.
+
+    Example:
+        stream = datasets.cloud_stream("scans", trajectory="poses.txt")
+        cloud, pose = stream[0]
     """
     folder = Path(folder)
     clouds = sorted((p for p in folder.iterdir() if p.suffix in _READERS), key=_natural)
@@ -65,7 +72,7 @@ def cloud_stream(
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key that puts 2 before 10."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in _parts(path.stem)]
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in _parts(path.stem)]
 
 
 def _parts(text: str) -> list[str]:
@@ -107,19 +114,41 @@ def _read_ply(path: Path) -> np.ndarray:
     import trimesh
 
     with open_regular(path) as file, parsing(path, "PLY file"):
-        header = file.read(65536).split(b"end_header")[0].decode("ascii", "replace")
-        size = file.seek(0, os.SEEK_END)
-        for name, count in re.findall(r"^element (\w+)\s+(\d+)", header, re.MULTILINE):
-            if int(count) > size:  # each takes a byte at least
-                raise ValueError(f"it declares {count} of {name} in {size} bytes")
-        file.seek(0)
+        counts = ply_counts(file)
         # Without the path, trimesh does not open other files that this one names.
         vertices = getattr(trimesh.load(file, "ply", process=False), "vertices", None)
         cloud = np.zeros((0, 3)) if vertices is None else np.asarray(vertices)
         # trimesh reads an ASCII file that is cut off after a line as a smaller cloud.
-        vertex = re.search(r"^element vertex (\d+)", header, re.MULTILINE)
-        _check_count(cloud, int(vertex[1]) if vertex else len(cloud))
+        _check_count(cloud, counts.get("vertex", len(cloud)))
     return cloud
+
+
+def ply_counts(file: BinaryIO) -> dict[str, int]:
+    """Reads how many of its elements a PLY file declares.
+
+    Args:
+        file: The file; it is read from its beginning, and left there.
+
+    Returns:
+        The counts by name, such as "vertex" and "face".
+
+    Raises:
+        ValueError: It has no such header, or declares more than fit into it.
+    """
+    file.seek(0)
+    header, end, _ = file.read(_PLY_HEADER_BYTES).partition(b"end_header")
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if not end:
+        raise ValueError(f"it has no end of a header in its first {_PLY_HEADER_BYTES} bytes")
+    counts = {}
+    for words in map(str.split, header.decode("ascii", "replace").split("\n")):
+        if words and "element" in words[0]:
+            _, name, count = words
+            counts[name] = int(count)
+            if not 0 <= counts[name] <= size:  # each takes a byte at least
+                raise ValueError(f"it declares {count} of {name} in {size} bytes")
+    return counts
 
 
 def _read_pcd(path: Path) -> np.ndarray:
@@ -158,6 +187,10 @@ def _check_declared(file: BufferedReader) -> None:
         least, inflated = struct.unpack("<II", file.read(8))
         if inflated != size:
             raise ValueError(f"it inflates to {inflated} bytes, expected {size}")
+        if inflated > most_inflated(rest):
+            raise ValueError(
+                f"it inflates to {inflated} bytes, expected at most {most_inflated(rest)}"
+            )
     most = most_returns(rest)
     if header.points > most or values > _PCD_VALUES:
         raise ValueError(

@@ -36,6 +36,10 @@ def kitti_stream(folder: str | os.PathLike[str]) -> FrameStream:
     Raises:
         FileNotFoundError: A file or folder is missing.
         ValueError: A file is malformed; the message names it and the line.
+
+    Example:
+        stream = datasets.kitti_stream("sequences/00")
+        cloud, pose = stream[0]
     """
     folder = Path(folder).absolute()
     scans = numbered_files(folder / "velodyne", r"(\d+)\.bin")

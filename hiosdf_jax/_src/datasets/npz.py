@@ -121,7 +121,7 @@ class NpzStream:
             raise ValueError(f"{self.path}: K = {matrix.tolist()}, expected focal lengths > 0")
         self._scale = self._positive("depth_scale")
         self._to_cloud = partial(_depth_to_cloud, intrinsics=matrix.astype(np.float32))
-        self._check_size(depth)
+        self._check_size(math.prod(depth.shape[1:]))
         return len(depth)
 
     def _check_range(self) -> int:
@@ -132,15 +132,16 @@ class NpzStream:
         self._scale = self._positive("range_scale")
         directions = self._arrays["directions"].astype(np.float32)
         self._to_cloud = partial(_ranges_to_cloud, directions=directions)
-        self._check_size(ranges)
+        self._check_size(math.prod(ranges.shape[1:]))
         return len(ranges)
 
-    def _check_size(self, images: np.ndarray) -> None:
+    def _check_size(self, returns: int) -> None:
+        """Raises if a frame has this many returns, which are too many."""
         most = most_returns(os.stat(self.path).st_size)
-        if math.prod(images.shape[1:]) > most:
+        if returns > most:
             raise ValueError(
-                f"{self.path}: {self._layout} has shape {images.shape}, expected at most "
-                f"{most} returns per frame"
+                f"{self.path}: {self._layout} has {returns} returns in a frame, expected at most "
+                f"{most}"
             )
 
     def _check_points(self) -> int:
@@ -164,6 +165,7 @@ class NpzStream:
                 f"{self.path}: offsets of frame {i} run from {edges[i]} to {edges[i + 1]}, "
                 f"expected offsets that never decrease"
             )
+        self._check_size(int(np.diff(edges).max(initial=0)))
         return len(offsets) - 1
 
     def _expect(self, key: str, shape: _Shape) -> None:
@@ -191,6 +193,10 @@ def read_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is no npz file, or some of the keys are missing or misshapen.
+
+    Example:
+        truth = datasets.read_truth("house_depth.npz")
+        print(truth.points_world.shape, truth.sdf.shape)
     """
     keys = ("visible", "visible_sdf", "visible_grad", "visible_frame", "surface")
     keys = tuple(f"eval_{key}" for key in keys)

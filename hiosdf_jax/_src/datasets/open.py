@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,8 +32,12 @@ def _is_bag(path: Path) -> bool:
     return path.is_file() and path.suffix in (".bag", ".mcap", ".db3")
 
 
+def _clouds_in(path: Path) -> set[str]:
+    return {each.name for each in path.iterdir() if each.suffix in (".ply", ".pcd")}
+
+
 def _has_clouds(path: Path) -> bool:
-    return path.is_dir() and any(each.suffix in (".ply", ".pcd") for each in path.iterdir())
+    return path.is_dir() and bool(_clouds_in(path))
 
 
 _FORMATS = {
@@ -57,6 +61,20 @@ _FORMATS = {
 }
 
 FORMATS = tuple(_FORMATS)
+
+
+def holds_recording(folder: Path, apart: Collection[str] = ()) -> bool:
+    """Whether a reader takes a folder for a stream, which another file would spoil.
+
+    Args:
+        folder: The folder.
+        apart: Names of files that do not count as clouds, such as meshes.
+
+    Returns:
+        Whether one does.
+    """
+    others = (each.fits(folder) for name, each in _FORMATS.items() if name != "clouds")
+    return any(others) or bool(_clouds_in(folder) - set(apart))
 
 
 def open_stream(path: str | os.PathLike[str], format: str | None = None, **options: Any) -> Stream:

@@ -36,6 +36,10 @@ def replicacad_stream(folder: str | os.PathLike[str]) -> FrameStream:
     Raises:
         FileNotFoundError: A file or folder is missing.
         ValueError: A file is malformed; the message names it and the line.
+
+    Example:
+        stream = datasets.replicacad_stream("apt_2_nav")
+        cloud, pose = stream[0]
     """
     folder = Path(folder)
     images = numbered_files(folder / "results", r"depth(\d+)\.png")

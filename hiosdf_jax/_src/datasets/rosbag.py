@@ -10,17 +10,18 @@ The `rosbags` package reads both kinds of bag without ROS.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import weakref
 from collections import defaultdict
 from collections.abc import Iterable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import open_regular, parsing
+from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
+from hiosdf_jax._src.datasets.inflating import limit_rosbags
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses
 from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
@@ -61,6 +62,10 @@ def rosbag_stream(
         ValueError: The bag cannot be read, a topic is missing or ambiguous, or the bag does not
             contain the motion of the sensor.
         ModuleNotFoundError: rosbags is not installed.
+
+    Example:
+        stream = datasets.rosbag_stream("drive", cloud_topic="/points", odometry_topic="/odom")
+        cloud, pose = stream[0]
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -70,14 +75,17 @@ def rosbag_stream(
             "ROS bags are read by rosbags: in a clone, pip install '.[ros]'"
         ) from error
     path = Path(path)
+    size = 0
     for each in path.iterdir() if path.is_dir() else [path]:
         if not each.is_dir():
-            open_regular(each).close()
+            with open_regular(each) as file:
+                size += os.fstat(file.fileno()).st_size
+    limit_rosbags()
     with parsing(path, "ROS bag"):
         # Older ROS 2 bags do not contain their types; the types read here have not changed.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
-    closing = ExitStack()
+    closing = contextlib.ExitStack()
     closing.callback(reader.close)
     with closing:
         clouds = _clouds(reader, path, cloud_topic)
@@ -114,9 +122,12 @@ def rosbag_stream(
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         start, among = times[index]
         with parsing(f"{path}, {clouds[0].topic} at {start} ns", "PointCloud2"):
-            messages = reader.messages(clouds, start=start, stop=start + 1)
-            connection, _, raw = next(m for i, m in enumerate(messages) if i == among)
+            with contextlib.closing(reader.messages(clouds, start=start, stop=start + 1)) as found:
+                connection, _, raw = next(m for i, m in enumerate(found) if i == among)
             message: Any = reader.deserialize(raw, connection.msgtype)
+            returns, most = int(message.height) * int(message.width), most_returns(size)
+            if returns > most:
+                raise ValueError(f"{returns} returns, expected at most {most}")
             cloud = cloud_of(message)
         upward = path_up(edges, _name(message.header.frame_id), world_frame)
         return cloud, transform_up(edges, upward, _seconds(message.header.stamp))

@@ -33,6 +33,10 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
     Raises:
         FileNotFoundError: A file or folder is missing.
         ValueError: A file is malformed; the message names it and the line.
+
+    Example:
+        stream = datasets.scannet_stream("scene0000_00")
+        cloud, pose = stream[0]
     """
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")

@@ -26,6 +26,11 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
 
     Raises:
         ValueError: Depth has fewer than two dimensions or intrinsics is not (3, 3).
+
+    Example:
+        depth = depth_mm / 1000.0  # (480, 640) m; 0 is no return
+        intrinsics = [[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]]
+        state = hio.update(state, datasets.depth_to_cloud(depth, intrinsics), pose)
     """
     depth = jnp.asarray(as_array("depth", depth))
     intrinsics = jnp.asarray(as_array("intrinsics", intrinsics))
@@ -54,6 +59,10 @@ def ranges_to_cloud(ranges: ArrayLike, directions: ArrayLike) -> Array:
 
     Raises:
         ValueError: Directions is not (*ranges.shape, 3).
+
+    Example:
+        cloud = datasets.ranges_to_cloud(ranges, directions)  # (16, 1800) m, (16, 1800, 3)
+        state = hio.update(state, cloud, pose)
     """
     ranges = jnp.asarray(as_array("ranges", ranges))
     directions = jnp.asarray(as_array("directions", directions))

@@ -145,6 +145,13 @@ def read_frame(stream: Stream, index: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         BadFrameError: The frame cannot be read, has no return, or has a pose that is not rigid.
+
+    Example:
+        for index in range(len(stream)):
+            try:
+                state = hio.update(state, *datasets.read_frame(stream, index))
+            except datasets.BadFrameError as error:
+                print(error)
     """
     try:
         cloud, pose = stream[index]
@@ -187,6 +194,10 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
     Raises:
         BadFrameError: A frame is bad and `skip_bad_frames` is False.
         ValueError: Margin is negative, or no frame is usable.
+
+    Example:
+        extent = datasets.find_bounds(stream)
+        config = hio.Config.light(extent.bounds, max_range=extent.max_range)
     """
     from tqdm import tqdm
 

@@ -50,6 +50,10 @@ def tum_stream(
         FileNotFoundError: A file is missing.
         ValueError: A file is malformed, and the message names it and the line; or the camera is
             unknown.
+
+    Example:
+        stream = datasets.tum_stream("desk", intrinsics=(517.3, 516.5, 318.6, 255.3))
+        cloud, pose = stream[0]
     """
     folder = Path(folder)
     images = []

@@ -71,6 +71,10 @@ def load_model() -> mujoco.MjModel:
 
     Returns:
         The model, in m, z up. The names of geoms less than 5 cm thick start with "thin_".
+
+    Example:
+        model = demo.load_model()
+        distance, _ = demo.signed_distance(model, np.array([[4.0, 2.0, 1.0]]))
     """
     xml = resources.files("hiosdf_jax._src.demo").joinpath("apartment.xml").read_text("utf-8")
     return mujoco.MjModel.from_xml_string(xml)
@@ -87,6 +91,9 @@ def camera_path(frames: int) -> np.ndarray:
 
     Raises:
         ValueError: `frames` < 1.
+
+    Example:
+        poses_world_sensor = demo.camera_path(frames=80)
     """
     if frames < 1:
         raise ValueError(f"frames = {frames}, expected >= 1")
@@ -197,6 +204,10 @@ def sample_truth(stream: ApartmentStream, count: int = 25000, seed: int = 1) -> 
 
     Raises:
         ValueError: A frame sees no surface.
+
+    Example:
+        truth = demo.sample_truth(demo.ApartmentStream(frames=80))
+        scores = scoring.evaluate(lambda points: hio.sdf_and_grad(field, points), truth)
     """
     rng = np.random.default_rng(seed)
     quotas = rng.multinomial(count, np.full(len(stream), 1 / len(stream)), size=2).T

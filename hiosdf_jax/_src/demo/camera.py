@@ -15,6 +15,9 @@ _DROP_OUT = 0.005  # fraction of pixels that drop out at random
 _FLYING = 0.15  # fraction of pixels at a depth edge that mix foreground and background
 _EDGE = 0.1  # depth step to a neighbor that makes an edge, relative to the nearer depth
 
+# mj_multiRay of MuJoCo 3 misses some surfaces that mj_ray finds.
+_ONE_BY_ONE = int(mujoco.__version__.split(".")[0]) < 4
+
 
 class DepthCamera:
     """A pinhole camera, horizontal field of view 90 degrees; x right, y down, z forward."""
@@ -99,6 +102,12 @@ class DepthCamera:
         directions = (self._rays / self._lengths[:, None]) @ pose[:3, :3].T
         count = len(directions)
         ranges, geoms = np.empty(count), np.empty(count, np.int32)
+        if _ONE_BY_ONE:
+            for k, direction in enumerate(directions):
+                ranges[k] = mujoco.mj_ray(
+                    self._model, self._data, pose[:3, 3], direction, None, 1, -1, geoms[k : k + 1]
+                )
+            return ranges / self._lengths, geoms
         mujoco.mj_multiRay(
             m=self._model,
             d=self._data,

@@ -37,6 +37,9 @@ def signed_distance(
     Raises:
         ValueError: `points_world` is not (N, 3) and finite, or the model has no geom, or a geom of
             another type.
+
+    Example:
+        distance, gradient = demo.signed_distance(demo.load_model(), np.array([[4.0, 2.0, 1.0]]))
     """
     points = np.asarray(points_world, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:

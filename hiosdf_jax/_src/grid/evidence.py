@@ -96,6 +96,20 @@ def read_window(config: Config, evidence: Evidence, rays: Rays) -> EvidenceWindo
     )
 
 
+def whole_window(evidence: Evidence) -> EvidenceWindow:
+    """Reads all of the evidence as one window, in float32."""
+    return EvidenceWindow(
+        start=jnp.zeros(3, jnp.int32),
+        hits=evidence.hits.astype(jnp.float32),
+        passes=evidence.passes.astype(jnp.float32),
+        behind=evidence.behind.astype(jnp.float32),
+        weight=evidence.root_weight.astype(jnp.float32) ** 2,
+        mean=evidence.mean.astype(jnp.float32),
+        axes=evidence.axes.astype(jnp.float32),
+        change=evidence.change,
+    )
+
+
 def fade_evidence(config: Config, window: EvidenceWindow) -> EvidenceWindow:
     """Scales evidence down so that a voxel remembers at most `evidence_limit` rays.
 
@@ -110,7 +124,7 @@ def fade_evidence(config: Config, window: EvidenceWindow) -> EvidenceWindow:
     """
     # Compared as stored: rounding must not count as new evidence at the next update, so that
     # nothing fades where no ray passes.
-    hits, passes = (_rounded(counts) for counts in (window.hits, window.passes))
+    hits, passes = (rounded(counts) for counts in (window.hits, window.passes))
     above = hits + passes > _ROUNDING * config.evidence_limit
     total = jnp.maximum(window.hits + window.passes, 1)
     scale = jnp.where(above, config.evidence_limit / total, 1)
@@ -161,8 +175,8 @@ def is_observed(passes: jax.Array, hits: jax.Array) -> jax.Array:
     return (passes > 0) | ((hits > 0) & (passes >= 0))
 
 
-def _rounded(values: jax.Array) -> jax.Array:
-    """Rounds as storing does; XLA may simplify a conversion there and back away."""
+def rounded(values: jax.Array) -> jax.Array:
+    """Rounds numbers as storing does; XLA may simplify a conversion there and back away."""
     kind = jnp.finfo(_STORED)
     return jax.lax.reduce_precision(values, kind.nexp, kind.nmant)
 

@@ -17,6 +17,9 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.vectors import Vector, each, split
 
+type Start = tuple[jax.Array | np.int32, ...]
+"""First voxel of a window: an int32 scalar for each axis, a constant where only one fits."""
+
 
 def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the voxels that contain points.
@@ -166,9 +169,7 @@ def window_shape(config: Config, reach: float) -> tuple[int, int, int]:
     return (min(x, span), min(y, span), min(z, span))
 
 
-def window_start(
-    config: Config, shape: tuple[int, int, int], center_world: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def window_start(config: Config, shape: tuple[int, int, int], center_world: jax.Array) -> Start:
     """Places a window around a point, moved to lie inside the grid.
 
     Args:
@@ -177,27 +178,27 @@ def window_start(
         center_world: (3,) m.
 
     Returns:
-        Its first voxel, three int32 scalars.
+        Its first voxel.
     """
     index, _, _ = voxel_of(config, center_world)
-    room = jnp.asarray(config.grid_shape, jnp.int32) - jnp.asarray(shape, jnp.int32)
-    start = jnp.clip(index - jnp.asarray(shape, jnp.int32) // 2, 0, room)
-    return start[0], start[1], start[2]
+    room = np.subtract(config.grid_shape, shape).astype(np.int32)
+    start = jnp.clip(index - np.asarray(shape, np.int32) // 2, 0, room)
+    # A constant where there is no choice: `jax.vmap` would make a gather of a read at `start`.
+    x, y, z = (start[axis] if room[axis] else np.int32(0) for axis in range(3))
+    return x, y, z
 
 
-def read_window(
-    array: jax.Array, start: tuple[jax.Array, ...], shape: tuple[int, int, int]
-) -> jax.Array:
+def read_window(array: jax.Array, start: Start, shape: tuple[int, int, int]) -> jax.Array:
     """Reads a window of a grid array; axes after the third are read whole."""
     rest = array.shape[3:]
     return jax.lax.dynamic_slice(array, _full_start(start, rest), (*shape, *rest))
 
 
-def write_window(array: jax.Array, start: tuple[jax.Array, ...], values: jax.Array) -> jax.Array:
+def write_window(array: jax.Array, start: Start, values: jax.Array) -> jax.Array:
     """Writes a window of a grid array."""
     return jax.lax.dynamic_update_slice(array, values, _full_start(start, array.shape[3:]))
 
 
-def _full_start(start: tuple[jax.Array, ...], rest: tuple[int, ...]) -> tuple[jax.Array, ...]:
+def _full_start(start: Start, rest: tuple[int, ...]) -> Start:
     # All int32: a plain 0 would be an int64 under jax_enable_x64.
-    return (*start, *(jnp.zeros((), jnp.int32) for _ in rest))
+    return (*start, *(np.int32(0) for _ in rest))

@@ -101,7 +101,8 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
 
     # It cancels from the mean, and so does its derivative.
     least = jax.lax.stop_gradient(jnp.min(jnp.where(found, distance, jnp.inf), axis=0))
-    nearness = jnp.exp(jnp.minimum(least - distance, 0) / _SOFT_VOXELS)
+    # Not by a minimum: at the nearest patch it would halve the derivative.
+    nearness = jnp.exp(jnp.where(found, least - distance, 0) / _SOFT_VOXELS)
     weight = jnp.where(counts, jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness, 0)
     total = jnp.where(any_found, jnp.sum(weight, axis=0), 1)
     sdf_m = jnp.sum(weight * value, axis=0) / total * config.voxel_size

@@ -36,7 +36,7 @@ class Part(NamedTuple):
         shape: Its shape, static.
     """
 
-    start: tuple[jax.Array | int, ...]
+    start: tuple[jax.Array | np.int32 | int, ...]
     shape: tuple[int, ...]
 
 
@@ -85,7 +85,7 @@ def _gather(values: jax.Array, index: jax.Array) -> jax.Array:
 
 
 def _chosen(
-    shape: tuple[int, ...], shift: jax.Array, axis: int, first: jax.Array | int
+    shape: tuple[int, ...], shift: jax.Array, axis: int, first: jax.Array | np.int32 | int
 ) -> jax.Array:
     """Returns flat indices of the voxels that lie `shift` voxels away along an axis.
 
@@ -111,7 +111,7 @@ def _transform_axis(
     along: jax.Array,
     axis: int,
     horizon: int,
-    first: jax.Array | int,
+    first: jax.Array | np.int32 | int,
     length: int,
 ) -> tuple[jax.Array, jax.Array]:
     """Finds the least squared distance over shifts along an axis, for `length` voxels of it.
@@ -158,10 +158,16 @@ def _transform_axis(
 
 
 def _transform_block(
-    squared: jax.Array, along: jax.Array, horizon: int, first: jax.Array | int, length: int
+    squared: jax.Array,
+    along: jax.Array,
+    horizon: int,
+    first: jax.Array | np.int32 | int,
+    length: int,
 ) -> tuple[jax.Array, jax.Array]:
     """Does the same for an array (A, N, B) along its middle axis."""
     reach = min(horizon, squared.shape[1] - 1)
+    # Otherwise XLA computes the candidates again for each shift, where it unrolls the loop.
+    squared, along = jax.lax.optimization_barrier((squared, along))
     across = pad_axis(squared - along * along, 1, reach, _INFINITE).part(first, length)
     along_axis = pad_axis(along, 1, reach).part(first, length)
     best = jax.lax.dynamic_slice_in_dim(squared, first, length, 1)

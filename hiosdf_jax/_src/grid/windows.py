@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
@@ -45,19 +46,19 @@ class Window(NamedTuple):
     """Two nested boxes of voxels: what is read, and the inner part that is written.
 
     Attributes:
-        start: First voxel of what is read, three int32 scalars.
+        start: First voxel of what is read.
         shape: Shape of what is read, static.
         inner_start: First voxel of what is written.
         inner_shape: Shape of what is written, static.
     """
 
-    start: tuple[jax.Array, ...]
+    start: geometry.Start
     shape: tuple[int, int, int]
-    inner_start: tuple[jax.Array, ...]
+    inner_start: geometry.Start
     inner_shape: tuple[int, int, int]
 
     @property
-    def within(self) -> tuple[jax.Array, ...]:
+    def within(self) -> geometry.Start:
         """First voxel of what is written, relative to `start`."""
         return tuple(a - b for a, b in zip(self.inner_start, self.start, strict=True))
 
@@ -102,7 +103,7 @@ def place_windows(
 
 def whole_grid(config: Config) -> Window:
     """Returns the window that reads and writes the whole grid."""
-    start = tuple(jnp.zeros((), jnp.int32) for _ in range(3))
+    start = (np.int32(0),) * 3
     return Window(start, config.grid_shape, start, config.grid_shape)
 
 

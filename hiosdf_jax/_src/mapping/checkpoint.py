@@ -16,10 +16,10 @@ from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.mapping.pipeline import init
+from hiosdf_jax._src.mapping.stored_values import check_array, check_grid
 from hiosdf_jax._src.numerics.intake import is_traced
-from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import Grid, MapState, Side, check_map
+from hiosdf_jax._src.state import Grid, MapState, check_map
 
 _FORMAT = "hiosdf_jax map"
 _VERSION = 4
@@ -45,23 +45,6 @@ _SINCE = {
 # Fields of the configuration that files of older versions do not have, by the version that has
 # them first, and the values that the code of the older version had in their place.
 _FIELDS_SINCE = {3: {"min_in_range": 0.01, "most_refusals": 10, "vanish_scans": 3}}
-
-# What no map exceeds. Distances in the grid are at most 127 voxels of 10 m along each axis.
-_LIMITS = {
-    "grid.hits": (0, 65504),
-    "grid.behind": (0, 65504),
-    "grid.weight": (0, 65504),
-    "grid.surface.mean": (-1, 1),
-    "grid.surface.axes": (-1, 1),
-    "grid.surface.sdf": (-2200, 2200),
-    "grid.surface.doubt": (0, 2200),
-    "grid.surface.side": (min(Side), max(Side)),
-    "network.optimizer.0.count": (0, 2**30),
-    "network.origin_world": (-FARTHEST_M, FARTHEST_M),
-    "optimism": (0, np.inf),
-    "updates": (0, 2**30),
-}
-_MOST_WEIGHT = 1e6  # of the network, and of the optimizer's moments
 
 
 def save(path: str | os.PathLike[str], state: MapState) -> None:
@@ -167,7 +150,8 @@ def load(path: str | os.PathLike[str]) -> MapState:
         expected = _named_leaves(template)
         later = {name for since, names in _SINCE.items() if version < since for name in names}
         for name in sorted(archive.names - {"header"} - expected.keys() | archive.names & later):
-            raise ValueError(f"{path} has the unknown array {name}")
+            shown = name if name.isprintable() else ascii(name)
+            raise ValueError(f"{path} has the unknown array {shown}")
         for name, leaf in expected.items():  # all, before one is inflated
             if name not in archive.names | later:
                 raise ValueError(f"{path} lacks the array {name}")
@@ -181,12 +165,13 @@ def load(path: str | os.PathLike[str]) -> MapState:
         leaves = [
             jnp.zeros(leaf.shape, leaf.dtype)
             if name in later
-            else jnp.asarray(_in_range(path, name, archive.read(name, whole=True)))
+            else jnp.asarray(_read_checked(archive, name))
             for name, leaf in expected.items()
         ]
     state = jax.tree.unflatten(jax.tree.structure(template), leaves)
     if version < 4:
         state = state.replace(grid=_with_sides(config, state.grid))
+    check_grid(path, config, state.grid)
     return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))
 
 
@@ -229,19 +214,9 @@ def _read_header(archive: Archive) -> tuple[int, Config, str]:
         raise ValueError(f"{path} has no valid configuration: {error}") from error
 
 
-def _in_range(path: str | os.PathLike[str], name: str, array: np.ndarray) -> np.ndarray:
-    """Returns an array of a file, or raises a ValueError if no map has such values."""
-    if name.startswith("report."):  # what it says decides nothing, and a failed loss is NaN
-        return array
-    weights = name.startswith("network.") and array.dtype.kind == "f"
-    unlimited = (-_MOST_WEIGHT, _MOST_WEIGHT) if weights else (-np.inf, np.inf)
-    least, most = _LIMITS.get(name, unlimited)
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{path} has {name} with values that are not finite")
-    if array.size and not (array.min() >= least and array.max() <= most):
-        raise ValueError(
-            f"{path} has {name} from {array.min()} to {array.max()}, expected {least} to {most}"
-        )
+def _read_checked(archive: Archive, name: str) -> np.ndarray:
+    array = archive.read(name, whole=True)
+    check_array(archive.path, name, array)
     return array
 
 

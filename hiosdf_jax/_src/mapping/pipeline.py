@@ -210,6 +210,10 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
 
     Raises:
         ValueError: `state` is not a map, or `stamp` is not one number, finite in float32.
+
+    Example:
+        field = hio.snapshot(state, stamp=12.5)
+        distance = hio.sdf(field, [1.0, 2.0, 0.5])  # while `state` is updated
     """
     check_map(state, stacked=True)
     seconds = as_array("stamp", stamp)
@@ -233,6 +237,9 @@ def grow(state: MapState, bounds: Any) -> MapState:
     Raises:
         ValueError: `state` is not a map, or traced; or the new bounds do not contain the old ones,
             or are none.
+
+    Example:
+        state = hio.grow(state, ((-5, -5, 0), (15, 10, 3)))  # it must contain the old box
     """
     check_map(state)
     if is_traced(*jax.tree.leaves(state)):

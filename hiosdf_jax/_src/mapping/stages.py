@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.lax import stop_gradient as held  # derivatives take it as it is
 
 from hiosdf_jax._src.change import directions, hiding, novelty, robot, smoothing, stray, vanishing
 from hiosdf_jax._src.config import Config
@@ -124,7 +125,7 @@ def place_cloud(step: Step) -> Step:
 
 def drop_stray(step: Step) -> Step:
     """Leaves out isolated returns: they leave no surface and clear no space."""
-    kept = ~stray.find_stray(step.rays)
+    kept = ~stray.find_stray(held(step.rays))
     placed = step.rays._replace(ends=step.rays.ends & kept, in_range=step.rays.in_range & kept)
     return step._replace(rays=placed)
 
@@ -138,14 +139,18 @@ def smooth_ranges(step: Step) -> Step:
 
 def compare_cloud(step: Step) -> Step:
     """Finds the returns on new things, and clouds that contradict the map as a whole."""
-    found = novelty.compare_cloud(step.config, step.state.grid, step.rays, step.state.updates)
+    found = novelty.compare_cloud(
+        step.config, held(step.state.grid), held(step.rays), step.state.updates
+    )
     contradicts = (step.flags == 0) & ~found.consistent
     return _flag(step._replace(novelty=found), Flag.INCONSISTENT_CLOUD, contradicts)
 
 
 def calibrate_bound(step: Step) -> Step:
     """Compares the map so far with the cloud, for the lower bound of the distance."""
-    optimism = calibration.calibrate_bound(field_of(step.state), step.rays, step.keys.bound)
+    optimism = calibration.calibrate_bound(
+        held(field_of(step.state)), held(step.rays), step.keys.bound
+    )
     return step._replace(state=step.state.replace(optimism=optimism))
 
 
@@ -162,19 +167,20 @@ def fuse_hits(step: Step) -> Step:
 
 def trace_rays(step: Step) -> Step:
     """Counts the rays through free voxels and marks hidden ones (IV-B)."""
-    return step._replace(window=carving.trace_rays(step.config, step.window, step.rays))
+    traced = carving.trace_rays(step.config, held(step.window), held(step.rays))
+    return step._replace(window=_with_patches(traced, step.window))
 
 
 def renew_evidence(step: Step) -> Step:
     """Lets new evidence outweigh old: things that appear, space that they hide, what vanished."""
-    config, before, placed = step.config, step.before, step.rays
-    window, fresh = hiding.add_new_surfaces(config, before, step.window, placed, step.novelty)
+    config, before, placed = step.config, held(step.before), held(step.rays)
+    window, fresh = hiding.add_new_surfaces(config, before, held(step.window), placed, step.novelty)
     view = directions.view_of(placed)
     window = hiding.hide_behind(config, before, window, placed, view, fresh)
     window = vanishing.drop_vanished(config, before, window, placed, view, step.state.updates)
     if step.robot is not None:
         window = robot.clear_robot(config, window, *step.robot)
-    return step._replace(window=window)
+    return step._replace(window=_with_patches(window, step.window))
 
 
 def fade_evidence(step: Step) -> Step:
@@ -192,36 +198,38 @@ def write_window(step: Step) -> Step:
 
 def update_distances(step: Step) -> Step:
     """Finds the nearest patch and the sign of every voxel (IV-B)."""
-    box = windows.box_of_rays(step.rays)
-    return _with_grid(step, distance.update_distances(step.config, step.state.grid, box))
+    grid, box = held(step.state.grid), windows.box_of_rays(held(step.rays))
+    derived = distance.update_distances(step.config, grid, box).derived
+    return _with_grid(step, step.state.grid.replace(derived=derived))
 
 
 def update_frontier(step: Step) -> Step:
     """Computes every voxel's distance to unseen space."""
-    box = windows.box_of_rays(step.rays)
-    return _with_grid(step, frontier.update_frontier(step.config, step.state.grid, box))
+    grid, box = held(step.state.grid), windows.box_of_rays(held(step.rays))
+    derived = frontier.update_frontier(step.config, grid, box).derived
+    return _with_grid(step, step.state.grid.replace(derived=derived))
 
 
 def sample_grid(step: Step) -> Step:
     """Draws training samples from the grid (IV-B)."""
     return step._replace(
-        samples=from_grid.sample_grid(step.config, step.state.grid, step.keys.grid)
+        samples=from_grid.sample_grid(step.config, held(step.state.grid), step.keys.grid)
     )
 
 
 def sample_cloud(step: Step) -> Step:
     """Adds training samples from the newest cloud: the local SDF (IV-C)."""
-    local = from_cloud.sample_cloud(step.config, step.rays, step.keys.cloud)
+    local = from_cloud.sample_cloud(step.config, held(step.rays), step.keys.cloud)
     return step._replace(samples=concatenate(step.samples, local))
 
 
 def train(step: Step) -> Step:
     """Fits the network to the samples (IV-D)."""
-    known = step.state.grid.evidence
+    known = held(step.state.grid.evidence)
     changed = jnp.sum(vanishing.is_recent(known.change)) / jnp.maximum(jnp.sum(known.hits > 0), 1)
     extra_epochs, average = training.schedule(step.config, step.state.updates, changed)
     network, losses, trained = training.train(
-        step.config, step.state.network, step.samples, extra_epochs, average, step.keys.order
+        step.config, held(step.state.network), step.samples, extra_epochs, average, step.keys.order
     )
     state = step.state.replace(network=network)
     return step._replace(state=state, losses=losses, trained=trained)
@@ -313,6 +321,16 @@ def _flag(step: Step, flag: Flag, raised: jax.Array) -> Step:
 def _has(step: Step, flags: Flag) -> jax.Array:
     """Returns whether this update has one of some flags."""
     return (step.flags & flags) > 0
+
+
+def _with_patches(
+    window: evidence.EvidenceWindow, patched: evidence.EvidenceWindow
+) -> evidence.EvidenceWindow:
+    """Gives a window the patches of another one, which carry the derivatives.
+
+    The stages between have changed its counts alone.
+    """
+    return window._replace(mean=patched.mean, axes=patched.axes)
 
 
 def _with_grid(step: Step, grid: Grid) -> Step:

@@ -33,6 +33,8 @@ def as_real(name: str, values: Any) -> np.ndarray:
     """
     if is_traced(values):
         raise ValueError(f"{name} is traced, expected concrete numbers, as outside jit")
+    if any(_is_boolean(leaf) for leaf in _leaves(values)):  # numpy makes 1 of True beside numbers
+        raise ValueError(f"{name} has booleans, expected real numbers")
     try:
         array = np.ma.asanyarray(values) if _has_mask(values) else np.asarray(values)
     except Exception as error:  # rows of different lengths, or whatever a foreign object raises
@@ -177,6 +179,12 @@ def _leaves(values: Any) -> list[Any]:
         if not inner:
             return found
     raise ValueError(f"lists are nested more than {_DEEPEST} deep, expected an array of numbers")
+
+
+def _is_boolean(value: Any) -> bool:
+    if isinstance(value, np.ndarray | jax.Array):
+        return bool(jnp.issubdtype(value.dtype, np.bool_))
+    return isinstance(value, bool | np.bool_)
 
 
 def _has_mask(values: Any) -> bool:

@@ -1,9 +1,10 @@
-"""The check that a pose is rigid, for `posed_cloud` outside jit and `mapping.pipeline` inside."""
+"""Rigid motions: the check of a pose, outside jit and inside, and its exact rotation."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 FARTHEST_M = 1e5
@@ -31,3 +32,16 @@ def is_rigid(pose: Any, np: Any = jnp) -> Any:
     last_row = np.all(np.abs(pose[3] - np.array([0.0, 0, 0, 1])) <= 1e-6)
     near = np.all(np.abs(pose[:3, 3]) <= FARTHEST_M)
     return orthonormal & last_row & (handed > 0) & near & np.all(np.isfinite(pose))
+
+
+def nearest_rotation(matrix: jax.Array) -> jax.Array:
+    """Returns the rotation nearest to a matrix (3, 3) that `is_rigid` accepts.
+
+    Newton's iteration for the polar decomposition: the deviation is squared in each step. A matrix
+    that is a rotation already keeps its digits.
+    """
+    for _ in range(3):
+        gram = jnp.sum(matrix[:, :, None] * matrix[:, None, :], axis=0)
+        step = 1.5 * jnp.eye(3, dtype=matrix.dtype) - 0.5 * gram
+        matrix = jnp.sum(matrix[:, :, None] * step[None], axis=1)
+    return matrix

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.numerics.modes import cond
 
@@ -29,7 +30,7 @@ class Padded(NamedTuple):
         first = self.reach + shift
         return jax.lax.dynamic_slice_in_dim(self.values, first, size, self.axis)
 
-    def part(self, first: jax.Array | int, size: int) -> Padded:
+    def part(self, first: jax.Array | np.int32 | int, size: int) -> Padded:
         """Cuts the array down to `size` elements from `first` on, which need not be static."""
         values = jax.lax.dynamic_slice_in_dim(self.values, first, size + 2 * self.reach, self.axis)
         return self._replace(values=values)

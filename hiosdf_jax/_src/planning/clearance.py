@@ -74,6 +74,10 @@ def sphere_clearance_and_grad(
 
     Raises:
         ValueError: As for `sphere_clearance`.
+
+    Example:
+        centers_world = jnp.array([[0.5, 0.0, 0.3], [0.7, 0.0, 0.3]])
+        clearance, grad = planning.sphere_clearance_and_grad(field, centers_world, radii=0.1)
     """
     centers, radii = checked_spheres(centers_world, radii, "centers_world")
     value, gradient = distance_and_grad(field, centers, unknown, bound)

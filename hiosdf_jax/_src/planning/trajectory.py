@@ -61,6 +61,12 @@ def waves(
 
     Raises:
         ValueError: A shape or a type is wrong, or a number is out of range.
+
+    Example:
+        start_world, goal_world = jnp.array([0.0, 0.0, 0.5]), jnp.array([2.0, 1.0, 0.5])
+        guesses = planning.waves(
+            jax.random.key(0), start_world, goal_world, count=16, waypoints=32, spread_m=0.3
+        )
     """
     key = as_key("key", key)
     start, goal = on_device("start_world", start_world), on_device("goal_world", goal_world)

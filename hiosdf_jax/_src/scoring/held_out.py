@@ -23,6 +23,10 @@ def held_out_frames(count: int) -> range:
 
     Returns:
         Their indices: every tenth, from the 16th on.
+
+    Example:
+        held_out = scoring.held_out_frames(len(stream))
+        mapped = [index for index in range(len(stream)) if index not in held_out]
     """
     return range(count)[_FIRST::_EVERY]
 
@@ -45,6 +49,10 @@ def draw_returns(
 
     Returns:
         (n, 3) m, world frame; 20,000 over all frames.
+
+    Example:
+        rng = np.random.default_rng(0)
+        returns_world = scoring.draw_returns(cloud, pose, config, frames=10, rng=rng)
     """
     ranges = np.linalg.norm(cloud, axis=-1)  # NaN for no return, and no comparison is True then
     cloud = cloud[(ranges >= config.min_range) & (ranges <= config.max_range)]
@@ -69,6 +77,13 @@ def score_held_out(
         `points`: N.
         `points_observed`: how many of them the map has observed.
         The scores of `held_out_surface` at these, if there are any.
+
+    Example:
+        scores = scoring.score_held_out(
+            lambda points: hio.sdf(field, points),
+            lambda points: hio.query(field, points).observed,
+            returns_world,
+        )
     """
     if not len(points_world):
         return {"points": 0, "points_observed": 0}

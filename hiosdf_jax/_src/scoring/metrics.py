@@ -179,6 +179,10 @@ def evaluate_bands(
 
     Raises:
         ValueError: As in `evaluate`.
+
+    Example:
+        bands = scoring.evaluate_bands(lambda points: hio.sdf_and_grad(field, points), truth)
+        print(scoring.format_bands(bands))
     """
     answers = _ask(sdf_and_grad, truth, last_frame)
     distance = np.abs(answers.sdf_true)
@@ -202,6 +206,9 @@ def evaluate_lower(
     Returns:
         `lower_coverage`: share of the points where the bound does not exceed the true distance.
         `lower_slack_cm`: mean of true distance - bound.
+
+    Example:
+        scores = scoring.evaluate_lower(lambda points: hio.query(field, points).lower, truth)
     """
     selected = np.full(len(truth.sdf), True) if last_frame is None else truth.frame <= last_frame
     slack = truth.sdf[selected].astype(float) - in_chunks(lower, truth.points_world[selected])
@@ -226,6 +233,10 @@ def held_out_surface(
 
     Raises:
         ValueError: points_world is not (N, 3) with N > 0, or the map returned the wrong shape.
+
+    Example:
+        scores = scoring.held_out_surface(lambda points: hio.sdf(field, points), returns_world)
+        print(scores["median_cm"])
     """
     points = np.asarray(points_world)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hiosdf_jax._src.datasets.files import open_regular, parsing, read_rows
+from hiosdf_jax._src.scoring.mesh_file import corners_and_faces, read_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -58,8 +59,8 @@ def read_scene(path: str | os.PathLike[str], sensor_path_world: np.ndarray) -> S
     """Reads a scene.
 
     Args:
-        path: A triangle mesh, in m and in the stream's world frame, in any format that trimesh
-            reads; or `sdf.npy` or its folder, see `grid_scene`.
+        path: A triangle mesh, in m and in the stream's world frame: a `.ply`, `.obj`, `.stl`,
+            `.off` or `.glb` file; or `sdf.npy` or its folder, see `grid_scene`.
         sensor_path_world: (F, 3) m, the sensor's positions; they decide what is free if the mesh is
             not watertight.
 
@@ -70,16 +71,16 @@ def read_scene(path: str | os.PathLike[str], sensor_path_world: np.ndarray) -> S
         FileNotFoundError: There is no such file.
         ValueError: The file cannot be read as a mesh or a grid.
         ModuleNotFoundError: A mesh needs libigl, which is not installed.
+
+    Example:
+        rays = scoring.read_rays(stream, max_range=6.0)
+        scene = scoring.read_scene("house.ply", scoring.sensor_path(rays))
     """
     path = Path(path)
     path.stat()
     if path.is_dir() or path.suffix == ".npy":
         return grid_scene(path if path.is_dir() else path.parent)
-    import trimesh
-
-    open_regular(path).close()
-    with parsing(path, "mesh"):
-        mesh = trimesh.load_mesh(path)
+    mesh = read_mesh(path)
     try:
         return mesh_scene(mesh, sensor_path_world)
     except ValueError as error:
@@ -98,9 +99,13 @@ def mesh_scene(mesh: trimesh.Trimesh, sensor_path_world: np.ndarray) -> Scene:
         The scene.
 
     Raises:
-        ValueError: The mesh has no triangles, or corners that are not finite; or the path is not
-            (F, 3), finite, F > 0.
+        ValueError: The mesh has no triangles, or corners that are not there or not finite; or the
+            path is not (F, 3), finite, F > 0.
         ModuleNotFoundError: libigl is not installed.
+
+    Example:
+        path_world = scoring.sensor_path(scoring.read_rays(stream))
+        scene = scoring.mesh_scene(trimesh.load("house.ply"), path_world)
     """
     vertices, faces, tree = triangle_tree(mesh)
     positions = _spread_positions(sensor_path_world)
@@ -171,7 +176,7 @@ def triangle_tree(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, Any]:
         Corners (V, 3) float64, triangles (F, 3) int64, and the `igl.AABB`, which takes both.
 
     Raises:
-        ValueError: The mesh has no triangles, or corners that are not finite.
+        ValueError: The mesh has no triangles, or corners that are not there or not finite.
         ModuleNotFoundError: libigl is not installed.
     """
     try:
@@ -181,7 +186,7 @@ def triangle_tree(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, Any]:
             "distances to a mesh need libigl: in a clone, pip install '.[truth]'"
         ) from error
 
-    vertices, faces = _corners_and_faces(mesh)
+    vertices, faces = corners_and_faces(mesh)
     tree = igl.AABB()
     tree.init(vertices, faces)
     return vertices, faces, tree
@@ -225,16 +230,6 @@ def grid_scene(folder: str | os.PathLike[str]) -> Scene:
         return sdf_at(points), slope / np.where(length > 0, length, np.nan)
 
     return Scene(sdf_and_grad, lambda points: sdf_at(np.asarray(points, float)), None)
-
-
-def _corners_and_faces(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """The corners (V, 3) float64 and the triangles (T, 3) int64 of a mesh, checked."""
-    vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
-    if not len(faces):
-        raise ValueError("the mesh has 0 triangles, expected at least 1")
-    if not np.isfinite(vertices).all():
-        raise ValueError("the mesh has corners that are not finite, expected m")
-    return vertices, faces
 
 
 def _spread_positions(sensor_path_world: np.ndarray) -> np.ndarray:

@@ -46,6 +46,9 @@ def evaluate_mesh(
 
     Raises:
         ModuleNotFoundError: libigl is not installed.
+
+    Example:
+        scores = scoring.evaluate_mesh(hio.extract_mesh(field), truth)
     """
     to_mesh = _distance_to(mesh)
     complete = to_mesh(truth.surface_points_world)
@@ -80,6 +83,10 @@ def evaluate_held_out_mesh(mesh: trimesh.Trimesh, points_world: np.ndarray) -> d
 
     Raises:
         ModuleNotFoundError: libigl is not installed.
+
+    Example:
+        mesh = hio.extract_mesh(field)
+        scores = scoring.evaluate_held_out_mesh(mesh, returns_world)
     """
     distance_cm = 100 * _distance_to(mesh)(points_world)
     return {
@@ -113,6 +120,15 @@ def evaluate_steps(
 
     Raises:
         ModuleNotFoundError: libigl is not installed.
+
+    Example:
+        scores = scoring.evaluate_steps(
+            lambda points: hio.sdf(field, points),
+            lambda points: hio.query(field, points).observed,
+            config.bounds,
+            hio.extract_mesh(field),
+            config.voxel_size,
+        )
     """
     rng = np.random.default_rng(0)
     low, high = np.asarray(bounds, float)

@@ -19,6 +19,10 @@ def format_table(scores: Mapping[str, float]) -> str:
     Returns:
         The table. Each row has a metric, its unit, which direction is better, and the score; a dash
         stands for "no value".
+
+    Example:
+        scores = scoring.evaluate(lambda points: hio.sdf_and_grad(field, points), truth)
+        print(scoring.format_table(scores))
     """
     cells = [["metric", "unit", "better", "ours"]]
     cells += [[*METRICS[key], format_score(key, scores[key])] for key in METRICS if key in scores]
@@ -33,6 +37,10 @@ def format_bands(bands: Mapping[str, Mapping[str, float]]) -> str:
 
     Returns:
         The table, one row per band, one column per metric.
+
+    Example:
+        bands = scoring.evaluate_bands(lambda points: hio.sdf_and_grad(field, points), truth)
+        print(scoring.format_bands(bands))
     """
     keys = [key for key in METRICS if any(key in scores for scores in bands.values())]
     cells = [["true distance", *keys]]
@@ -51,6 +59,9 @@ def format_score(key: str, value: Any) -> str:
     Returns:
         Two decimals for centimeters, none for parts per million, three for anything else; a dash
         for no value or NaN.
+
+    Example:
+        print(scoring.format_score("visible_cm", 0.4213))  # 0.42
     """
     if value is None or not np.isfinite(np.mean(value)):
         return "-"
@@ -68,6 +79,9 @@ def lay_out(cells: Sequence[Sequence[str]], text_columns: int) -> str:
 
     Returns:
         The table, without a trailing line break.
+
+    Example:
+        print(scoring.lay_out([["map", "cm"], ["ours", "0.42"]], text_columns=1))
     """
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     lines = [

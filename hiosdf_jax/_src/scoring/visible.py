@@ -43,6 +43,10 @@ def read_rays(stream: Stream, max_range: float = np.inf) -> StreamRays:
 
     Raises:
         ValueError: No frame has a return in range.
+
+    Example:
+        rays = scoring.read_rays(stream, max_range=6.0)
+        path_world = scoring.sensor_path(rays)
     """
     from tqdm import tqdm
 
@@ -77,6 +81,9 @@ def sensor_path(rays: StreamRays) -> np.ndarray:
 
     Returns:
         (F, 3) float64 m, world frame, one position per frame that has rays.
+
+    Example:
+        path_world = scoring.sensor_path(scoring.read_rays(stream))
     """
     return rays.origin_world[np.unique(rays.frame, return_index=True)[1]]
 

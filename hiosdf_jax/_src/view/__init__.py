@@ -1,1 +1,1 @@
-"""Pictures of maps, drawn without a display."""
+"""Pictures of maps, drawn without a display, and the live view in a browser."""

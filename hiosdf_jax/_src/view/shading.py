@@ -9,11 +9,9 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from hiosdf_jax._src.output_files import replacing
 
@@ -74,54 +72,115 @@ def save_shaded(
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise ValueError(f"up_world = {up_world}, expected 3 finite numbers, not all 0")
     up = up / np.linalg.norm(up)
-    picture = _shade(mesh, size, up)
+    view = viewpoint(mesh, size, up)
+    picture = np.ones((size[1], size[0], 3)) if view is None else shade(mesh, view)
     with replacing(path) as file:
         matplotlib.image.imsave(file, picture, format=Path(path).suffix[1:] or "png")
 
 
-def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.ndarray:
-    """Renders a mesh; returns (height, width, 3) in 0..1."""
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-    camera = _camera_axes(vertices, up)
-    width, height = (_SUPERSAMPLING * side for side in size)
+class Viewpoint(NamedTuple):
+    """From where a mesh is drawn: a parallel projection, chosen by `viewpoint`.
 
-    a, b, c = vertices[faces.T]
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=-1)
-    shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
-    if not shown.any():
-        return np.ones((size[1], size[0], 3))
-    shown[shown] = ~_remains_of_ceiling(vertices @ up, faces[shown], length[shown])
-    normal = normal[shown] / length[shown, None]
-    corners = vertices[faces[shown]]  # (F, 3, 3)
+    Attributes:
+        size: (width, height) of the picture in pixels.
+        axes: (3, 3), rows: right, up and toward the viewer of the picture, world frame.
+        middle: (2,) m along right and up, what the middle of the picture shows.
+        nearest: m along the third axis, the point nearest to the viewer.
+        scale: Samples per m; a pixel has 2 x 2 samples.
+        up_world: (3,) unit vector against gravity.
+        heights: Lowest and highest height of the palette, m along `up_world`.
+    """
 
-    view = corners @ camera.T  # m along the picture's right, up and toward the viewer
+    size: tuple[int, int]
+    axes: np.ndarray
+    middle: np.ndarray
+    nearest: float
+    scale: float
+    up_world: np.ndarray
+    heights: tuple[float, float]
+
+    def project(self, points_world: np.ndarray) -> np.ndarray:
+        """Where points lie in the picture.
+
+        Args:
+            points_world: (..., 3) m.
+
+        Returns:
+            (..., 3) column, row and depth in samples, (0, 0) in the middle of the upper left one.
+        """
+        width, height = (_SUPERSAMPLING * side for side in self.size)
+        view = points_world @ self.axes.T
+        column = (view[..., 0] - self.middle[0]) * self.scale + (width - 1) / 2
+        row = (self.middle[1] - view[..., 1]) * self.scale + (height - 1) / 2
+        return np.stack([column, row, (self.nearest - view[..., 2]) * self.scale], axis=-1)
+
+    def pixels(self, points_world: np.ndarray) -> np.ndarray:
+        """The column and row of points, in pixels: (..., 2)."""
+        return (self.project(points_world)[..., :2] + 0.5) / _SUPERSAMPLING - 0.5
+
+
+def viewpoint(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> Viewpoint | None:
+    """Chooses a viewpoint that shows a whole mesh.
+
+    Args:
+        mesh: The mesh.
+        size: (width, height) in pixels.
+        up: (3,) unit vector against gravity.
+
+    Returns:
+        The viewpoint; None if all faces look away from it.
+    """
+    axes = _camera_axes(np.asarray(mesh.vertices, float), up)
+    corners, _ = _shown(mesh, axes, up)
+    if not len(corners):
+        return None
+    view = corners @ axes.T  # m along the picture's right, up and toward the viewer
     lower, upper = view.min(axis=(0, 1)), view.max(axis=(0, 1))
+    width, height = (_SUPERSAMPLING * side for side in size)
     extent = upper - lower
-    scale = (1 - 2 * _MARGIN) * min(width / extent[0], height / extent[1])  # pixels / m
+    scale = (1 - 2 * _MARGIN) * min(width / extent[0], height / extent[1])
     middle = (lower + upper) / 2
-    column = (view[..., 0] - middle[0]) * scale + (width - 1) / 2
-    row = (middle[1] - view[..., 1]) * scale + (height - 1) / 2
-    depth = (upper[2] - view[..., 2]) * scale  # >= 0, pixels, away from the viewer
-    face, depth = _rasterize(np.stack([column, row, depth], axis=-1), width, height)
+    low, high = np.percentile(corners @ up, [1, 99])
+    return Viewpoint(size, axes, middle[:2], upper[2], scale, up, (low, high))
+
+
+def shade(mesh: trimesh.Trimesh, view: Viewpoint) -> np.ndarray:
+    """Draws a mesh; faces that are not wholly in the picture are left out.
+
+    Args:
+        mesh: The mesh.
+        view: From where.
+
+    Returns:
+        (height, width, 3) in 0..1.
+    """
+    size, up, camera = view.size, view.up_world, view.axes
+    width, height = (_SUPERSAMPLING * side for side in size)
+    corners, normal = _shown(mesh, camera, up)
+    projected = view.project(corners)
+    # A mesh that the viewpoint was chosen for is inside, but for rounding.
+    inside = (projected[..., :2] >= 0) & (projected[..., :2] <= [width - 1, height - 1])
+    inside = inside.all(axis=(1, 2)) & (projected[..., 2] > -1e-6 * max(size)).all(axis=1)
+    projected, normal = projected[inside], normal[inside]
+    face, depth = _rasterize(np.maximum(projected, 0), width, height)
     covered = face >= 0
 
     light = _LIGHT @ np.stack([camera[0], np.cross(camera[0], up), up])
     # Wrapped Lambert shading: a wall in the shade still shows its shape.
     cosine = normal @ light / np.linalg.norm(light)
     brightness = _AMBIENT + (1 - _AMBIENT) * (1 + cosine) / 2
-    low, high = np.percentile(corners @ up, [1, 99])
+    low, high = view.heights
     stops = np.linspace(low, max(high, low + 1e-9), len(_PALETTE))
-    shade = _occlusion(depth, covered)
+    darkening = _occlusion(depth, covered)
     image = np.ones((size[1], size[0], 3))
     for top in range(0, size[1], _ROWS_PER_BAND):
         band = slice(_SUPERSAMPLING * top, _SUPERSAMPLING * (top + _ROWS_PER_BAND))
         inside = covered[band]
-        # From pixels back to m: the height of the surface at each pixel.
+        # From samples back to m: the height of the surface at each sample.
         rows = np.nonzero(inside)[0] + band.start
-        level = (middle[1] + ((height - 1) / 2 - rows) / scale) * (camera[1] @ up)
-        level += (upper[2] - depth[band][inside] / scale) * (camera[2] @ up)
-        factor = brightness[face[band][inside]] * shade[band][inside]
+        level = (view.middle[1] + ((height - 1) / 2 - rows) / view.scale) * (camera[1] @ up)
+        level += (view.nearest - depth[band][inside] / view.scale) * (camera[2] @ up)
+        factor = brightness[face[band][inside]] * darkening[band][inside]
         fine = np.ones((*inside.shape, 3))
         for k, channel in enumerate(_PALETTE.T):
             fine[inside, k] = np.interp(level, stops, channel) * factor
@@ -130,7 +189,21 @@ def _shade(mesh: trimesh.Trimesh, size: tuple[int, int], up: np.ndarray) -> np.n
     return np.clip(image, 0, 1)
 
 
-def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
+def _shown(
+    mesh: trimesh.Trimesh, camera: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The faces that a picture shows: their corners (F, 3, 3) m, and their normals (F, 3)."""
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces).reshape(-1, 3)
+    a, b, c = vertices[faces.T]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=-1)
+    shown = normal @ camera[2] > 1e-12 * length  # the others look away, or have no area
+    if shown.any():
+        shown[shown] = ~remains_of_ceiling(vertices @ up, faces[shown], length[shown])
+    return vertices[faces[shown]], normal[shown] / length[shown, None]
+
+
+def remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Returns a mask of the faces of small pieces near the top, remains of a rough ceiling.
 
     Args:
@@ -141,6 +214,9 @@ def _remains_of_ceiling(level: np.ndarray, faces: np.ndarray, area: np.ndarray) 
     Returns:
         (F,) bool.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(level), len(level)))
     count, piece = connected_components(graph, directed=False)

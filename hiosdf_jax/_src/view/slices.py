@@ -14,7 +14,7 @@ from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.output_files import replacing
 
 _COLUMNS = 400  # samples along the longer side of a slice
-_CHUNK = 16384  # points per query; one shape, so that a jitted map compiles once
+CHUNK = 16384  # points per query; one shape, so that a jitted map compiles once
 _ERROR_CM = 10.0  # end of the color scale of errors
 _PANEL_INCHES = 5.0
 _SURFACE_REACH = 0.15  # m; surfaces lie at the edge of observed space, or a voxel beyond
@@ -142,5 +142,5 @@ def _sample(function: Callable[[np.ndarray], Any], points: np.ndarray, name: str
     """Evaluates a function at (H, W, 3) points in chunks of one shape; returns (H, W) floats."""
     flat = points.reshape(-1, 3).astype(np.float32)
     values = np.empty(len(flat))
-    fill_in_chunks(lambda rows: (function(flat[rows]),), {name: values}, _CHUNK)
+    fill_in_chunks(lambda rows: (function(flat[rows]),), {name: values}, CHUNK)
     return values.reshape(points.shape[:2])

@@ -51,6 +51,8 @@ _SETTINGS = (
 )
 """Settings of JAX that the child takes from its parent."""
 
+_ENDING_S = 2.0  # from the loss of the connection to the exit
+
 inside = False
 """Whether this process is such a child: it starts none itself."""
 
@@ -167,10 +169,14 @@ class Child:
                 self._first = None
             self.state = None if request[0] == "fuse" else self.state
             self._connection.send(request)
-            answer: Answer = self._connection.recv()
+            packed_answer = self._connection.recv_bytes()
         except (EOFError, OSError) as error:
-            self.stop()  # if it is only the connection that is gone
+            self._end()
             raise self._how_it_ended() from error
+        try:
+            answer: Answer = pickle.loads(packed_answer)
+        except Exception as reason:  # whatever an object of the user's raises
+            raise RefusedError(reason) from reason
         if answer.raised is not None:
             raise answer.raised
         try:
@@ -181,6 +187,13 @@ class Child:
         if answer.refused is not None:
             raise RefusedError(answer.refused) from answer.refused
         return answer.result
+
+    def _end(self) -> None:
+        """Waits for the end of a process whose connection is gone, or kills it."""
+        try:
+            self._process.wait(_ENDING_S)
+        except subprocess.TimeoutExpired:
+            self.stop()
 
     def _how_it_ended(self) -> RuntimeError:
         code = self._process.wait()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import dataclasses
 import math
 import threading
 from typing import Any, Literal
@@ -25,6 +26,19 @@ _MOST_SECONDS = 2.0**20
 
 _CLOSING_S = 300.0  # an update that has to be compiled first takes a minute on a busy machine
 _NO_TIMES = str | bytes | bool | np.bool_  # although `float` takes them
+
+
+@dataclasses.dataclass
+class _Request:
+    """Somebody waits for the map.
+
+    Attributes:
+        frames: Number of frames that the map has to hold, if they are not dropped or rejected.
+        state: The map, as soon as it is there.
+    """
+
+    frames: int
+    state: MapState | None = None
 
 
 class BackgroundMapper:
@@ -89,8 +103,10 @@ class BackgroundMapper:
         self._process = process
         self._published = publish(state, serve)
         self._waiting: Frame | None = None
-        self._wanted = False
-        self._busy = False
+        self._put = 0  # frames so far; the newest of them is the one that waits
+        self._taken = 0  # the same, when the last one was taken to be fused
+        self._handled = 0  # those that are fused, dropped or rejected
+        self._requests: list[_Request] = []
         self._closed = False
         self._changed = threading.Condition()
         self._fuser = Child(state, self._notify) if process else Fuser(state)
@@ -156,11 +172,12 @@ class BackgroundMapper:
             if self._closed:
                 raise RuntimeError("the BackgroundMapper is closed")
             self.dropped += self._waiting is not None
+            self._put += 1
             self._waiting = Frame(cloud, pose, seconds, robot, noise)
             self._changed.notify_all()
 
     def wait(self, timeout_s: float | None = None) -> MapState:
-        """Waits until every frame is fused or dropped.
+        """Waits until every frame that was put before is fused or dropped.
 
         Args:
             timeout_s: Longest time to wait, s; None waits as long as it takes.
@@ -175,11 +192,17 @@ class BackgroundMapper:
         """
         timeout_s = _timeout(timeout_s)
         with self._changed:
-            self._wanted = True
+            request = _Request(self._put)
+            self._requests.append(request)
             self._changed.notify_all()
-            done = self._changed.wait_for(lambda: self._is_done() or self._has_ended(), timeout_s)
+            try:
+                self._changed.wait_for(lambda: request.state or self._has_ended(), timeout_s)
+            finally:
+                self._requests = [other for other in self._requests if other is not request]
+            if request.state is not None:
+                return request.state
             self._check()
-            if not done:
+            if not self._has_ended():
                 raise TimeoutError(f"the BackgroundMapper still works after {timeout_s} s")
             return self._state()
 
@@ -241,7 +264,7 @@ class BackgroundMapper:
                 if isinstance(task, Frame):
                     self._fuse(task)
                 else:
-                    self._fuser.fetch()
+                    self._fetch()
             self._fuser.fetch()
         except BaseException as failure:
             with self._changed:
@@ -251,21 +274,27 @@ class BackgroundMapper:
 
     def _next(self) -> Frame | Literal["fetch", "end"]:
         with self._changed:
-            self._busy = False
-            self._changed.notify_all()
             self._changed.wait_for(
-                lambda: self._waiting or self._wanted or self._closed or self._fuser.fault
+                lambda: self._due() or self._waiting or self._closed or self._fuser.fault
             )
             if self._fuser.fault is not None and not self._closed:
                 raise self._fuser.fault
+            if self._due():  # before the next frame: a sensor may be faster than the map
+                return "fetch"
             frame, self._waiting = self._waiting, None
-            if frame is None and not self._wanted:
-                return "end"
-            self._busy = True
-            if frame is not None:
-                return frame
-            self._wanted = False
-            return "fetch"
+            self._taken = self._put
+            return "end" if frame is None else frame
+
+    def _due(self) -> list[_Request]:
+        return [request for request in self._requests if request.frames <= self._handled]
+
+    def _fetch(self) -> None:
+        state = self._fuser.fetch()
+        with self._changed:
+            for request in self._due():
+                request.state = state
+            self._requests = [request for request in self._requests if request.state is None]
+            self._changed.notify_all()
 
     def _fuse(self, frame: Frame) -> None:
         try:
@@ -273,9 +302,7 @@ class BackgroundMapper:
         except RefusedError as refusal:
             self.rejected += 1
             self.rejection = refusal.reason
-
-    def _is_done(self) -> bool:
-        return self._waiting is None and not self._busy and self._fuser.state is not None
+        self._handled = self._taken
 
     def _has_ended(self) -> bool:
         return self.failure is not None or not self._thread.is_alive()

@@ -37,7 +37,7 @@ def work(connection: Connection) -> NoReturn:
         answer = Answer()
         while answer.raised is None:
             answer = _answer(fuser, *connection.recv())
-            connection.send(answer)
+            connection.send_bytes(_packed(answer))
     except (EOFError, OSError):  # the parent has ended
         pass
     os._exit(0)
@@ -53,7 +53,7 @@ def _answer(fuser: Fuser, request: str, *arguments: Any) -> Answer:
             refused = _portable(error.reason)
         except BaseException as error:
             raised = _portable(error)
-    warned = [Warned(str(w.message), w.category, w.filename, w.lineno) for w in caught]
+    warned = [Warned(str(w.message), _known(w.category), w.filename, w.lineno) for w in caught]
     return Answer(result, refused, raised, tuple(warned))
 
 
@@ -63,6 +63,26 @@ def _fuse(fuser: Fuser, frame: Frame, packed_serve: bytes) -> Any:
         return field if function is None else function(field)
 
     return fuser.fuse(frame, serve)
+
+
+def _packed(answer: Answer) -> bytes:
+    """Pickles an answer; of a result that cannot be, such as a lock, only the reason."""
+    try:
+        return pickle.dumps(answer)
+    except Exception as error:
+        reason = ValueError(f"serve returned what cannot leave the mapping process: {error}")
+        return pickle.dumps(Answer(refused=reason))
+
+
+def _known(category: type[Warning]) -> type[Warning]:
+    """Returns the nearest class of a warning that the parent can import."""
+    for kind in category.__mro__:
+        try:
+            pickle.dumps(kind)
+        except Exception:  # a class inside a function
+            continue
+        return kind
+    return Warning
 
 
 def _portable(error: Any) -> Any:

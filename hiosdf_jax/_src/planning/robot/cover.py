@@ -14,8 +14,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-SignedDistance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(N, 3) m -> lower and upper bounds of the signed distance, (N,) m each."""
+Bounds = tuple[np.ndarray, np.ndarray]
+"""Lower and upper bounds of the signed distance, (N,) m each."""
+
+
+class Solid(NamedTuple):
+    """A solid by bounds of the signed distance to it.
+
+    Attributes:
+        distance: (N, 3) m -> bounds.
+        quick: The same for many points; may be looser far from the surface.
+    """
+
+    distance: Callable[[np.ndarray], Bounds]
+    quick: Callable[[np.ndarray], Bounds]
+
 
 SphereCover = tuple[np.ndarray, np.ndarray]
 """Centers (S, 3) and radii (S,), m, float64."""
@@ -25,7 +38,7 @@ SphereCover = tuple[np.ndarray, np.ndarray]
 _CELL = 1 / 8
 _CENTER = 1 / 2
 # Half diagonal over depth: deep inside, where the balls are large, cells may be larger too.
-_CELL_BY_DEPTH = 1 / 4
+_CELL_BY_DEPTH = 3 / 8
 # Most cells and centers per round of the greedy choice; rounds repeat until all are covered.
 _MOST_CELLS = 12_000
 _MOST_CENTERS = 4_000
@@ -103,7 +116,7 @@ def cover_box(half: np.ndarray, tolerance: float) -> SphereCover:
 
 
 def cover_solid(
-    distance: SignedDistance,
+    solid: Solid,
     low: np.ndarray,
     high: np.ndarray,
     tolerance: float,
@@ -112,7 +125,7 @@ def cover_solid(
     """Covers a solid given by its signed distance.
 
     Args:
-        distance: Bounds of the signed distance.
+        solid: The solid.
         low: (3,) m, low corner of a box that contains the solid.
         high: (3,) m, high corner.
         tolerance: m, > 0.
@@ -125,38 +138,43 @@ def cover_solid(
     from scipy.spatial import KDTree
 
     random = np.random.default_rng(0)
-    cells, reach = _partition(distance, low, high, _CELL * tolerance)
+    cells, reach = _partition(solid, low, high, _CELL * tolerance)
     check_time()
-    tree = KDTree(cells)
-    centers, size = _partition(distance, low, high, _CENTER * tolerance)
+    tree = KDTree(cells, leafsize=32, balanced_tree=False)
+    centers, size = _partition(solid, low, high, _CENTER * tolerance)
     # With the cells' corners, so that planes of symmetry carry centers.
     corners = (centers[:, None] + _CORNERS * size[:, None, None] / np.sqrt(3)).reshape(-1, 3)
-    centers = np.unique(np.concatenate([centers, corners]).round(9), axis=0)
-    radii = tolerance - distance(centers)[1]
+    centers = _distinct(np.concatenate([centers, corners]), tolerance)
+    radii = tolerance - _estimate(solid, centers)
     centers, radii = centers[radii >= tolerance], radii[radii >= tolerance]
     balls: list[_Ball] = []
-    uncovered = np.ones(len(cells), bool)
+    uncovered, left = np.ones(len(cells), bool), len(cells) + 1
     while uncovered.any():
         check_time()
         some = _draw(random, np.nonzero(uncovered)[0], _MOST_CELLS)
-        rows = _draw(random, np.arange(len(centers)), _MOST_CENTERS)
         # The ball around a cell's own center always contains the cell.
-        own = cells[_draw(random, some, _MOST_OWN)]
-        tried = np.concatenate([centers[rows], own])
-        largest = np.concatenate([radii[rows], tolerance - distance(own)[1]])
-        picked = _choose(tried, largest, cells[some], reach[some])
-        assert picked, "a ball around the center of a cell contains the cell"
-        for k in picked:
-            near = np.asarray(tree.query_ball_point(tried[k], largest[k]), int)
-            needed = np.linalg.norm(cells[near] - tried[k], axis=1) + reach[near]
-            held = needed <= largest[k]
-            balls.append(_Ball(tried[k], largest[k], near[held], needed[held]))
-            uncovered[near[held]] = False
+        tried = cells[_draw(random, some, _MOST_OWN)]
+        if uncovered.sum() < left:
+            left = uncovered.sum()
+            rows = _draw(random, np.arange(len(centers)), _MOST_CENTERS)
+            # Estimates suffice for a choice.
+            largest = np.concatenate([radii[rows], tolerance - _estimate(solid, tried)])
+            tried = np.concatenate([centers[rows], tried])
+        else:  # they stalled it
+            largest = tolerance - solid.distance(tried)[1]
+        picked = tried[_choose(tried, largest, cells[some], reach[some])]
+        for center, radius in zip(picked, tolerance - solid.distance(picked)[1], strict=True):
+            near = np.asarray(tree.query_ball_point(center, radius), int)
+            needed = np.linalg.norm(cells[near] - center, axis=1) + reach[near]
+            held = needed <= radius
+            if held.any():
+                balls.append(_Ball(center, radius, near[held], needed[held]))
+                uncovered[near[held]] = False
     return _tighten(balls, len(cells))
 
 
 def _partition(
-    distance: SignedDistance, low: np.ndarray, high: np.ndarray, finest: float
+    solid: Solid, low: np.ndarray, high: np.ndarray, finest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cubes that contain a solid: centers (N, 3) and half diagonals (N,), at most `finest`."""
     edge = 2 * finest / np.sqrt(3)
@@ -167,7 +185,7 @@ def _partition(
     parts = []
     while len(centers):
         reach = edge * np.sqrt(3) / 2
-        least, greatest = distance(centers)
+        least, greatest = solid.quick(centers)
         touching = least <= reach
         centers, depth = centers[touching], -greatest[touching]
         done = (reach <= finest * (1 + 1e-9)) | (reach <= _CELL_BY_DEPTH * depth)
@@ -175,6 +193,18 @@ def _partition(
         centers = (centers[~done][:, None] + _CORNERS * edge / 4).reshape(-1, 3)
         edge /= 2
     return np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts])
+
+
+def _distinct(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Drops points that equal others up to a hundredth of the tolerance."""
+    steps = np.rint((points - points.min(axis=0)) * (100 / tolerance)).astype(np.int64)
+    return points[np.unique(steps @ [1, 1 << 21, 1 << 42], return_index=True)[1]]
+
+
+def _estimate(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Signed distance midway between its quick bounds, (N,) m."""
+    least, greatest = solid.quick(points)
+    return (least + greatest) / 2
 
 
 def _draw(random: np.random.Generator, index: np.ndarray, most: int) -> np.ndarray:

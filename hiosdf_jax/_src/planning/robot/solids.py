@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 
-from hiosdf_jax._src.planning.robot.cover import SignedDistance
+from hiosdf_jax._src.planning.robot.cover import Bounds, Solid
 
 # Relative error that the search for the nearest point of a mesh may make.
 _SEARCH = 0.01
 
-# Most nodes of the lattice that separates a mesh's inside, if half the tolerance is fine enough.
-_MOST_NODES = 3_000_000
+# Tolerance over the distance from a point of a mesh to the nearest sample of it.
+_SAMPLES_PER_TOLERANCE = 16
+
+# Most cells of the lattice that separates a mesh's inside, if half the tolerance is fine enough.
+_MOST_CELLS = 3_000_000
 
 
-def cylinder(radius: float, half_length: float) -> SignedDistance:
+def cylinder(radius: float, half_length: float) -> Solid:
     """Returns the signed distance to a cylinder along z.
 
     Args:
@@ -26,11 +30,11 @@ def cylinder(radius: float, half_length: float) -> SignedDistance:
         The distance; both bounds are exact.
     """
 
-    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distance(points: np.ndarray) -> Bounds:
         value = distance_beyond(cylinder_profile(points, radius, half_length))
         return value, value
 
-    return distance
+    return Solid(distance, distance)
 
 
 def cylinder_profile(points: np.ndarray, radius: float, half_length: float) -> np.ndarray:
@@ -61,7 +65,7 @@ def distance_beyond(faces: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("ij,ij->i", outside, outside)) + np.minimum(faces.max(axis=1), 0)
 
 
-def ellipsoid(semi_axes: np.ndarray) -> SignedDistance:
+def ellipsoid(semi_axes: np.ndarray) -> Solid:
     """Returns the signed distance to an ellipsoid.
 
     Args:
@@ -73,7 +77,7 @@ def ellipsoid(semi_axes: np.ndarray) -> SignedDistance:
     squares = semi_axes**2
     least = squares.min()
 
-    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distance(points: np.ndarray) -> Bounds:
         # The nearest point is r_k^2 p_k / (t + r_k^2) for the t > -min r^2 that puts it on the
         # surface. Off the planes of symmetry exactly one such t exists.
         p = np.maximum(np.abs(points), 1e-9 * semi_axes.max())
@@ -88,14 +92,14 @@ def ellipsoid(semi_axes: np.ndarray) -> SignedDistance:
         value = np.linalg.norm(p - nearest, axis=1) * np.where(high > 0, 1, -1)
         return value, value
 
-    return distance
+    return Solid(distance, distance)
 
 
-def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> SignedDistance:
+def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
     """Returns bounds of the signed distance to a triangle mesh and all that it encloses.
 
-    An open mesh is a sheet. Hollows are enclosed if only gaps narrower than half the tolerance lead
-    to them.
+    An open mesh is a sheet. Gaps narrower than a tenth of the tolerance count as closed, gaps wider
+    than 1.5 tolerances as open.
 
     Args:
         vertices: (V, 3) m.
@@ -106,47 +110,98 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> SignedDis
         The distance; the bounds are some tenths of the tolerance apart.
     """
     # Imported here: a robot that loads its spheres from a file needs none of them.
-    import trimesh
     from scipy import ndimage
     from scipy.spatial import KDTree
 
-    # Each point of a triangle is within its longest edge / sqrt(3) of one of its corners.
-    edge = tolerance / 10
-    longest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max()
-    rounds = int(np.ceil(np.log2(max(longest / edge, 1)))) + 2
-    fine = trimesh.remesh.subdivide_to_size(vertices, faces, edge, max_iter=rounds)[0]
-    error = edge / np.sqrt(3)
-    tree = KDTree(fine)
+    error = tolerance / _SAMPLES_PER_TOLERANCE
+    samples = _on_triangles(vertices[faces], error)
+    tree = KDTree(samples, leafsize=32, balanced_tree=False)
+    low, high = samples.min(axis=0), samples.max(axis=0)
 
-    # Neighbors on a lattice are on the same side if the surface is farther from one of them than
-    # half their distance. What is not connected to the outside is enclosed.
-    extents = fine.max(axis=0) - fine.min(axis=0)
-    affordable = (np.prod(extents + tolerance) / _MOST_NODES) ** (1 / 3)
-    pitch = float(np.clip(affordable, tolerance / 10, tolerance / 2))
-    corner = fine.min(axis=0) - 3 * pitch
-    counts = np.ceil((fine.max(axis=0) - corner) / pitch).astype(int) + 4
-    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
-    nodes = corner + pitch * index.reshape(-1, 3)
-    gap = (
-        np.asarray(tree.query(nodes, distance_upper_bound=2 * pitch, workers=-1)[0]).reshape(counts)
-        - error
-    )
-    labeled: Any = ndimage.label(gap > pitch / 2)
+    # Connected cells that the surface does not touch are on the same side of it. What is not
+    # connected to the outside is enclosed.
+    affordable = (np.prod(high - low + tolerance) / _MOST_CELLS) ** (1 / 3)
+    pitch = float(np.clip(affordable, 2 * error, tolerance / 2))
+    corner = low - 3 * pitch
+    counts = np.ceil((high - corner) / pitch).astype(int) + 3
+    touched = np.zeros(counts, bool)
+    for offset in itertools.product((-error, error), repeat=3):
+        touched[tuple(((samples + offset - corner) / pitch).astype(int).T)] = True
+    labeled: Any = ndimage.label(~touched)
     regions = np.asarray(labeled[0])
-    enclosed = (regions != regions[0, 0, 0]) & (regions > 0)
-    outside = regions == regions[0, 0, 0]
+    side = np.where(regions == regions[0, 0, 0], 1, -1).astype(np.int8)
+    side[touched] = 0
+    steps: Any = ndimage.distance_transform_edt(~touched)
+    # The surface touches a cell, or is farther from its center than half the diagonal by `error`
+    # along each axis.
+    half_diagonal = np.sqrt(3) * pitch / 2
+    slack = half_diagonal + np.sqrt(3) * error
 
-    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def signed(points: np.ndarray, near: np.ndarray, far: np.ndarray) -> Bounds:
+        """Bounds of the signed distance by those of the distance."""
+        place = (points - corner) / pitch
+        cell = np.floor(place).astype(int)
+        sign = np.where(np.all((cell >= 0) & (cell < counts), axis=1), 0, 1)
+        cell = np.clip(cell, 0, counts - 1)
+        sign = np.where(sign == 0, side[tuple(cell.T)], sign)
+        # A point of a touched cell is on the side of the next cell if that is nearer than the
+        # surface.
+        rows = np.nonzero(sign == 0)[0]
+        for axis, step in itertools.product(range(3), (-1, 1)):
+            part = place[rows, axis] - cell[rows, axis]
+            beside = cell[rows].copy()
+            beside[:, axis] = np.clip(beside[:, axis] + step, 0, counts[axis] - 1)
+            gap = pitch * (1 - part if step > 0 else part)
+            sign[rows] = np.where(gap < near[rows], side[tuple(beside.T)], sign[rows])
+            rows = rows[sign[rows] == 0]
+        return np.where(sign > 0, near, -far), np.where(sign < 0, -near, far)
+
+    def tight(points: np.ndarray) -> Bounds:
         # Approximate: exact searches from deep inside are slow.
         far = np.asarray(tree.query(points, eps=_SEARCH, workers=-1)[0])
-        near = np.maximum(far / (1 + _SEARCH) - error, 0)
-        node = np.rint((points - corner) / pitch).astype(int)
-        within = np.all((node >= 0) & (node < counts), axis=1)
-        x, y, z = np.where(within[:, None], node, 0).T
-        # A point is on its node's side if the surface is farther than the node.
-        decided = np.linalg.norm(points - (corner + pitch * np.stack([x, y, z], -1)), axis=1) < near
-        is_in = within & decided & enclosed[x, y, z]
-        is_out = ~within | (decided & outside[x, y, z])
-        return np.where(is_out, near, -far), np.where(is_in, -near, far)
+        return signed(points, np.maximum(far / (1 + _SEARCH) - error, 0), far)
 
-    return distance
+    def quick(points: np.ndarray) -> Bounds:
+        cell = np.clip(((points - corner) / pitch).astype(int), 0, counts - 1)
+        offset = np.linalg.norm(points - (corner + pitch * (cell + 0.5)), axis=1)
+        center = pitch * np.asarray(steps)[tuple(cell.T)]
+        box = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1)
+        near = np.maximum(np.maximum(center - offset - half_diagonal, box - error), 0)
+        far = center + offset + slack
+        # Cheap where the surface is close, which is where it matters.
+        close = np.nonzero(near < pitch)[0]
+        if len(close):
+            most = float(far[close].max())
+            found = tree.query(points[close], distance_upper_bound=most, workers=-1)[0]
+            far[close] = np.minimum(far[close], found)
+            near[close] = np.maximum(near[close], far[close] - error)
+        return signed(points, near, far)
+
+    return Solid(tight, quick)
+
+
+def _on_triangles(triangles: np.ndarray, error: float) -> np.ndarray:
+    """Samples triangles (F, 3, 3) m: each of their points is within `error` of a sample."""
+    # Rows along the longest edge. Seen from a point between two rows, the row nearer to that edge
+    # is opposite.
+    lengths = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+    first = lengths.argmax(axis=1)
+    order = (first[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(triangles, order[:, :, None], axis=1).transpose(1, 0, 2)
+    edge = lengths.max(axis=1)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    height = area / np.maximum(edge, 1e-300)
+    rows = np.ceil(height * np.sqrt(2) / error).astype(int) + 1
+    face, row = _repeated(rows)
+    t = (row / np.maximum(rows[face] - 1, 1))[:, None]
+    start, end = a[face] + t * (c - a)[face], b[face] + t * (c - b)[face]
+    count = np.ceil(np.linalg.norm(end - start, axis=1) / (np.sqrt(2) * error)).astype(int) + 1
+    line, k = _repeated(count)
+    s = (k / np.maximum(count[line] - 1, 1))[:, None]
+    return start[line] + s * (end - start)[line]
+
+
+def _repeated(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each index as often as it counts, and 0, 1, ... for each."""
+    index = np.repeat(np.arange(len(counts)), counts)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -1,15 +1,13 @@
 """A MuJoCo robot as spheres on its bodies, and their clearance in a configuration."""
 
-# mujoco's bindings carry no types that pyright can see.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import math
 import os
+import threading
 import time
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -24,8 +22,16 @@ from hiosdf_jax._src.numerics.exporting import exportable
 from hiosdf_jax._src.numerics.gradient import least
 from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.output_files import check_output
 from hiosdf_jax._src.planning.clearance import sphere_clearance, sphere_clearance_and_grad
-from hiosdf_jax._src.planning.robot import cover, solids
+from hiosdf_jax._src.planning.robot.cover import SphereCover
+from hiosdf_jax._src.planning.robot.cover_files import cache_key, read_covers, write_covers
+from hiosdf_jax._src.planning.robot.geoms import (
+    chosen_geoms,
+    compiled_model,
+    cover_geom,
+    describe_geom,
+)
 from hiosdf_jax._src.state import Bound
 
 
@@ -64,12 +70,14 @@ def spheres_from_model(
     geoms: Iterable[int | str] | None = None,
     *,
     budget_s: float = math.inf,
+    cache: str | os.PathLike[str] | None = None,
 ) -> RobotSpheres:
     """Covers geoms of a robot by spheres that protrude by at most a tolerance.
 
     The cover is complete. A mesh is covered as it is, with all that it encloses, not as the convex
     hull that MuJoCo collides. Half the tolerance takes about four times as many spheres. Not inside
-    jit. Meshes take seconds to minutes: a bar in the terminal shows the progress.
+    jit. Meshes take seconds: a bar in the terminal shows the progress, and `cache` keeps the
+    result.
 
     Example:
         model = mujoco.MjModel.from_xml_path("examples/rover.xml")
@@ -82,6 +90,8 @@ def spheres_from_model(
             are covered; by default those that can move, or all but the world if none can.
         geoms: Names or ids of the geoms to cover, instead of `bodies`.
         budget_s: Longest time that it may take, s. It is exceeded by up to the time of one search.
+        cache: An `.npz` file, whose folder must exist. If it holds the spheres of the same geoms
+            and tolerance they are read from it, otherwise it is written.
 
     Returns:
         The spheres, in the order of the geoms.
@@ -90,39 +100,68 @@ def spheres_from_model(
         UserWarning: A chosen body has geoms, but none that collides: nothing covers it.
 
     Raises:
-        ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen, or
-            a chosen geom is a plane, a height field or an SDF.
+        ValueError: The tolerance is not positive, a body or geom is unknown, no geom is chosen, a
+            chosen geom is a plane, a height field or an SDF, or `cache` is another kind of file.
         TimeoutError: The time is up.
+        OSError: The file cannot be read or written.
     """
+    tolerance_m = as_number("tolerance_m", tolerance_m, 0, above=True)
+    if budget_s != math.inf:
+        budget_s = as_number("budget_s", budget_s)
+    model = compiled_model(model)
+    chosen = chosen_geoms(model, bodies, geoms)
+    if cache is None:
+        covers = _cover_geoms(model, chosen, tolerance_m, budget_s)
+    else:
+        key = cache_key(tolerance_m, [describe_geom(model, geom) for geom in chosen])
+        covers = read_covers(cache, key, len(chosen))
+        if covers is None:
+            check_output(cache)
+            covers = _cover_geoms(model, chosen, tolerance_m, budget_s)
+            write_covers(cache, key, covers)
+    carriers = np.asarray(model.geom_bodyid)[chosen]
+    return RobotSpheres(
+        body=jnp.asarray(np.repeat(carriers, [len(radii) for _, radii in covers]), jnp.int32),
+        centers_body=jnp.asarray(np.concatenate([centers for centers, _ in covers]), jnp.float32),
+        radii=jnp.asarray(np.concatenate([radii for _, radii in covers]), jnp.float32),
+    )
+
+
+def _cover_geoms(
+    model: Any, chosen: list[int], tolerance: float, budget_s: float
+) -> list[SphereCover]:
+    """Covers geoms on all cores: numpy and scipy let other threads run while they work."""
     # Imported here: a robot that loads its spheres from a file needs no progress bar.
     from tqdm import tqdm
 
-    tolerance_m = as_number("tolerance_m", tolerance_m, 0, above=True)
-    model = _compiled_model(model)
-    chosen = _chosen_geoms(model, bodies, geoms)
-    start, parts = time.monotonic(), []
+    start, done, stopped = time.monotonic(), [], threading.Event()
 
     def check_time() -> None:
-        if time.monotonic() - start > budget_s:
+        if stopped.is_set() or time.monotonic() - start > budget_s:
             raise TimeoutError(
-                f"covered {len(parts)} of {len(chosen)} geoms in budget_s = {budget_s} s, expected "
-                f"all: allow more time, a tolerance above {tolerance_m} m, or simpler geoms"
+                f"covered {len(done)} of {len(chosen)} geoms in budget_s = {budget_s} s, expected "
+                f"all: allow more time, a tolerance above {tolerance} m, or simpler geoms"
             )
 
-    # Without a terminal, or within two seconds, nothing is shown.
-    for geom in tqdm(chosen, desc="covering geoms by spheres", delay=2, disable=None):
+    def covered(geom: int) -> SphereCover:
         check_time()
-        centers, radii = _cover_geom(model, geom, tolerance_m, check_time)
-        rotation = _rotation(np.asarray(model.geom_quat[geom], float))
-        centers_body = np.asarray(model.geom_pos[geom], float) + centers @ rotation.T
-        body = np.full(len(radii), model.geom_bodyid[geom])
-        parts.append((body, centers_body, radii))
-    body, centers_body, radii = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return RobotSpheres(
-        body=jnp.asarray(body, jnp.int32),
-        centers_body=jnp.asarray(centers_body, jnp.float32),
-        radii=jnp.asarray(radii, jnp.float32),
-    )
+        found = cover_geom(model, geom, tolerance, check_time)
+        done.append(geom)
+        return found
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            # Without a terminal, or within two seconds, nothing is shown.
+            found = tqdm(
+                pool.map(covered, chosen),
+                total=len(chosen),
+                desc="covering geoms by spheres",
+                delay=2,
+                disable=None,
+            )
+            return list(found)
+        finally:
+            stopped.set()  # an error or an interrupt ends the other threads, too
 
 
 @plain
@@ -141,6 +180,13 @@ def place_spheres(spheres: RobotSpheres, data: Any) -> jax.Array:
     Raises:
         ValueError: An argument is of a wrong kind, a shape of the poses is wrong, there are fewer
             bodies than the spheres need, or (outside jit) kinematics has not run.
+
+    Example:
+        model = mujoco.MjModel.from_xml_path("examples/rover.xml")
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        spheres = planning.spheres_from_model(model, tolerance_m=0.02)
+        centers_world = planning.place_spheres(spheres, data)
     """
     _check_spheres(spheres)
     if not (hasattr(data, "xpos") and hasattr(data, "xmat")):
@@ -260,139 +306,8 @@ def robot_clearance_and_grad(
     return least(value), per_body(force), per_body(jnp.where(nearest[..., None], torque, 0))
 
 
-def _compiled_model(model: Any) -> Any:
-    """Reads the model of a file, or compiles that of a specification."""
-    if isinstance(model, str | os.PathLike):
-        import mujoco
-
-        return mujoco.MjModel.from_xml_path(os.fspath(model))
-    if hasattr(model, "compile") and not hasattr(model, "nbody"):
-        return model.compile()
-    if not hasattr(model, "geom_bodyid"):
-        raise ValueError(
-            f"model is {type(model).__name__}, expected a MjModel, mjx.Model, MjSpec or a path"
-        )
-    return model
-
-
 def _check_spheres(spheres: Any) -> None:
     if not isinstance(spheres, RobotSpheres):
         raise ValueError(
             f"spheres is {type(spheres).__name__}, expected RobotSpheres from spheres_from_model"
         )
-
-
-def _chosen_geoms(model: Any, bodies: Any, geoms: Any) -> list[int]:
-    if bodies is not None and geoms is not None:
-        raise ValueError("bodies and geoms are both given, expected at most one of them")
-    if geoms is not None:
-        chosen = _ids(model, geoms, "geom", model.ngeom)
-    else:
-        carriers = (
-            _moving_bodies(model) if bodies is None else _ids(model, bodies, "body", model.nbody)
-        )
-        colliding = (np.asarray(model.geom_contype) != 0) | (
-            np.asarray(model.geom_conaffinity) != 0
-        )
-        carried = np.isin(np.asarray(model.geom_bodyid), list(carriers))
-        chosen = np.nonzero(colliding & carried)[0].tolist()
-        _warn_of_bare_bodies(model, carried, chosen)
-    if not chosen:
-        raise ValueError("no geom is chosen, expected geoms, or bodies with colliding geoms")
-    return sorted(set(chosen))
-
-
-def _moving_bodies(model: Any) -> list[int]:
-    """Lists the bodies that can move, or all but the world where none can."""
-    moving = np.nonzero(np.asarray(model.body_weldid) != 0)[0].tolist()
-    return moving or list(range(1, model.nbody))
-
-
-def _warn_of_bare_bodies(model: Any, carried: np.ndarray, chosen: list[int]) -> None:
-    bodies = np.asarray(model.geom_bodyid)
-    bare = sorted(set(bodies[carried].tolist()) - set(bodies[chosen].tolist()))
-    if bare and chosen:
-        names = [_name(model, "body", body) for body in bare]
-        warnings.warn(
-            f"bodies {names} have geoms but none that collides, so that no sphere covers them: "
-            f"choose geoms by geoms= if they should be covered",
-            stacklevel=4,
-        )
-
-
-def _ids(model: Any, wanted: Any, kind: str, count: int) -> list[int]:
-    if isinstance(wanted, str):
-        raise ValueError(f"{kind} names are the string {wanted!r}, expected a list of names")
-    names = [_name(model, kind, k) for k in range(count)]
-    ids = []
-    for item in wanted:
-        if isinstance(item, str):
-            if item not in names:
-                raise ValueError(f"the model has no {kind} {item!r}, expected one of {names}")
-            ids.append(names.index(item))
-        elif 0 <= item < count:
-            ids.append(int(item))
-        else:
-            raise ValueError(f"the model has no {kind} {item}, expected 0 to {count - 1}")
-    return ids
-
-
-def _name(model: Any, kind: str, index: int) -> str:
-    start = int(getattr(model, f"name_{kind}adr")[index])
-    return model.names[start : model.names.index(b"\0", start)].decode()
-
-
-def _cover_geom(
-    model: Any, geom: int, tolerance: float, check_time: Callable[[], None]
-) -> cover.SphereCover:
-    # Imported here: nothing else in this module needs it.
-    import mujoco
-
-    size = np.asarray(model.geom_size[geom], float)
-    kind = mujoco.mjtGeom(int(model.geom_type[geom]))
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return cover.cover_capsule(size[0], 0.0, tolerance)
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return cover.cover_capsule(size[0], size[1], tolerance)
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return cover.cover_box(size, tolerance)
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        half = size[[0, 0, 1]]
-        return cover.cover_solid(
-            solids.cylinder(size[0], size[1]), -half, half, tolerance, check_time
-        )
-    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        return cover.cover_solid(solids.ellipsoid(size), -size, size, tolerance, check_time)
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        vertices, faces = _mesh(model, int(model.geom_dataid[geom]))
-        solid = solids.mesh(vertices, faces, tolerance)
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        return cover.cover_solid(solid, low, high, tolerance, check_time)
-    raise ValueError(
-        f"geom {geom} ({_name(model, 'geom', geom)!r}) is of type "
-        f"{kind.name.removeprefix('mjGEOM_').lower()}, expected sphere, capsule, box, cylinder, "
-        f"ellipsoid or mesh"
-    )
-
-
-def _mesh(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) m, geom frame, and faces (F, 3) of a mesh."""
-
-    def rows(array: Any, starts: Any) -> np.ndarray:
-        last = starts[mesh + 1] if mesh + 1 < len(starts) else len(array)
-        return np.asarray(array)[starts[mesh] : last]
-
-    vertices = rows(model.mesh_vert, model.mesh_vertadr).astype(float)
-    return vertices, rows(model.mesh_face, model.mesh_faceadr)
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

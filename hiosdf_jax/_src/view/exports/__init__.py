@@ -1,0 +1,1 @@
+"""Files of maps for other programs, one module per format."""
