@@ -18,6 +18,8 @@ from hiosdf_jax._src.mapping.merging import correct, merge, transform
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
+from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
+from hiosdf_jax._src.mapping.tracking import predict_pose, track
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 from hiosdf_jax._src.view.live import Viewer, view
 
@@ -39,6 +41,7 @@ __all__ = [
     "MapState",
     "Query",
     "Registration",
+    "Relocalization",
     "Report",
     "Viewer",
     "bake",
@@ -52,12 +55,15 @@ __all__ = [
     "moving_rows",
     "pad_cloud",
     "planning",
+    "predict_pose",
     "query",
     "refine_pose",
+    "relocalize",
     "save",
     "sdf",
     "sdf_and_grad",
     "snapshot",
+    "track",
     "transform",
     "update",
     "view",

@@ -12,6 +12,7 @@ from hiosdf_jax._src.mapping import pipeline
 
 CENTERS = np.array([[0.3, 0.05, 0.0], [0.42, 0.05, 0.05]], np.float32)  # m, world
 RADII = np.array([0.06, 0.05], np.float32)
+NO_FLAG = jnp.uint32(0)
 
 
 def cloud_with_an_arm():
@@ -167,7 +168,9 @@ def test_a_pose_too_far_away_is_refused(empty_map):
         hio.update(empty_map, cloud, pose)
     padded = np.full((CONFIG.max_points, 3), np.nan, np.float32)
     padded[: len(cloud)] = cloud
-    inside = pipeline._update_jit(empty_map, padded, pose)  # what `update` compiles
+    inside = pipeline._update_jit(
+        empty_map, padded, pose, None, None, NO_FLAG
+    )  # what `update` compiles
     flag = jnp.uint32(hio.Flag.BAD_POSE)
     flagged = empty_map.report.replace(flags=flag, update_flags=flag)
     assert arrays_equal(inside, empty_map.replace(report=flagged))
@@ -193,7 +196,7 @@ def test_bad_extras_inside_jit_change_nothing_and_raise_a_flag(empty_map, extras
     noise = extras.get("noise")
     noise = None if noise is None else jnp.asarray(noise, jnp.float32)
     # What `update` has compiled for the tests above.
-    after = pipeline._update_jit(empty_map, padded, pose, extras.get("robot"), noise)
+    after = pipeline._update_jit(empty_map, padded, pose, extras.get("robot"), noise, NO_FLAG)
     flag = jnp.uint32(hio.Flag.BAD_ARGUMENT)
     flagged = empty_map.report.replace(flags=flag, update_flags=flag)
     assert arrays_equal(after, empty_map.replace(report=flagged))

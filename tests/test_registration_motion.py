@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hiosdf_jax._src.mapping.registration.motion import motion_between, move, rotation_of, vector_of
+from hiosdf_jax._src.mapping.registration.motion import (
+    motion_between,
+    move,
+    rotation_of,
+    vector_of,
+    way_and_angle,
+)
 
 ANGLES = [0.0, 1e-6, 9e-4, 1.1e-3, 0.1, 2.0, 3.0]
 
@@ -27,6 +33,15 @@ def test_a_motion_leads_from_one_pose_to_another():
     second[:3, :3] = Rotation.from_rotvec([0.1, 0.4, 0.8]).as_matrix()
     first[:3, 3], second[:3, 3] = rng.normal(size=(2, 3))
     np.testing.assert_allclose(move(first, motion_between(first, second)), second, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.01, 1.0, 3.0, np.pi])
+def test_poses_are_apart_by_a_way_and_an_angle(angle):
+    first, second = np.eye(4), np.eye(4)
+    first[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix()
+    second[:3, :3] = Rotation.from_rotvec([0, angle, 0]).as_matrix() @ first[:3, :3]
+    second[:3, 3] = [3, 0, 4]
+    np.testing.assert_allclose(way_and_angle(first, second), [5, angle], atol=1e-3)
 
 
 @pytest.mark.parametrize("angle", ANGLES[:-1])

@@ -155,6 +155,19 @@ def test_rows_without_returns_change_nothing(room):
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_small_cloud_is_used_whole_however_it_is_padded(room):
+    rng = np.random.default_rng(12)
+    cloud, pose = room_cloud(12, COUNT)
+    cloud = noisy(cloud, rng)
+    start = perturbed(pose, rng, 0.05, 3)
+    padded = hio.refine_pose(room, cloud, start, noise=NOISE)  # outside jit, to 16,384 rows
+    whole = refine(room, cloud, start)
+    np.testing.assert_allclose(padded.pose, whole.pose, atol=1e-4)
+    np.testing.assert_allclose(padded.residual, whole.residual, atol=1e-4)
+    np.testing.assert_allclose(padded.covariance, whole.covariance, rtol=0.05, atol=1e-7)
+    assert float(padded.inliers) == pytest.approx(float(whole.inliers), abs=0.002)
+
+
 def corridor_cloud(rng, count=COUNT):
     along, height = rng.uniform(-1.2, 1.2, count), rng.uniform(-0.8, 0.8, count)
     side = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)

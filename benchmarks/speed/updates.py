@@ -59,7 +59,15 @@ def whole_updates(setup: Setup, label: str, mapped: Mapped) -> Measured:
     state = mapped.state
     cloud, pose = setup.frame(int(state.updates))
     prepared = jax.device_put(posed_cloud.prepare(cloud, pose, state.config.max_points))
-    alone = time_ms(pipeline._update_jit, state, *prepared, seconds=setup.sizes.seconds)
+    alone = time_ms(
+        pipeline._update_jit,
+        state,
+        *prepared,
+        None,
+        None,
+        np.uint32(0),
+        seconds=setup.sizes.seconds,
+    )
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     resident = resident_mb(resource.getrusage(resource.RUSAGE_SELF))
     rows = [

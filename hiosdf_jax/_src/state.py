@@ -65,6 +65,8 @@ class Flag(enum.IntFlag):
     BAD_ARGUMENT = 64
     """Inside jit, `robot` or `noise` was not finite or out of range. That update changed nothing
     else."""
+    NOT_REGISTERED = 128
+    """`track` found no pose at which the cloud fits the map. It was not fused."""
 
     def __str__(self) -> str:
         """Returns the names of the flags with `|` between them, or "none"."""

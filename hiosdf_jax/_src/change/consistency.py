@@ -17,9 +17,10 @@ from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.state import Grid
 
-# The map can judge a cloud after this many updates. It looks at about this many rays.
-_CONFIDENT_UPDATES = 5
-_JUDGED = 1024
+CONFIDENT_UPDATES = 5
+"""The map can judge a cloud after this many updates."""
+
+_JUDGED = 1024  # rays, about
 
 # A cloud contradicts the map if more than this share of the rays that can be compared is wrong, and
 # this share of all rays: they end in free space or go through walls. On house_depth and house_lidar
@@ -109,7 +110,7 @@ def judge(
     def skip(_: Rays) -> tuple[jax.Array, jax.Array]:
         return jnp.float32(directions.UNKNOWN), jnp.float32(directions.UNKNOWN)
 
-    suspicious = (updates >= _CONFIDENT_UPDATES) & exceeds(_NOISE_WRONG, _LEAST_NOISE_WRONG)
+    suspicious = (updates >= CONFIDENT_UPDATES) & exceeds(_NOISE_WRONG, _LEAST_NOISE_WRONG)
     smooth, smooth_novel = cond(suspicious, look, skip, rays)
     noise = suspicious & (smooth != directions.UNKNOWN) & (smooth < _LEAST_SMOOTH)
     fills_view = (

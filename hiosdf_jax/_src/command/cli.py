@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from hiosdf_jax._src.command.live_map import LiveMap
     from hiosdf_jax._src.command.progress import SavedMap
+    from hiosdf_jax._src.command.tracker import Tracker
     from hiosdf_jax._src.config import Config
     from hiosdf_jax._src.datasets.stream import Stream
     from hiosdf_jax._src.datasets.truth import GroundTruth
@@ -74,6 +75,8 @@ examples:
   hiosdf map drive/ --save map.npz --checkpoint-every 100
   hiosdf map drive/ --save map.npz --resume map.npz
       write the map after every 100 updates, and go on with it after a stop or a crash
+  hiosdf map drive/ --refine-poses
+      poses that drift: also writes trajectory.txt, trajectory.npz and trajectory.png
 
 The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
@@ -263,6 +266,11 @@ def _plan(options: argparse.Namespace) -> None:
 
 def _map(options: argparse.Namespace) -> None:
     place = options.stream.absolute()
+    tracking = "--odometry" if options.odometry else "--refine-poses"
+    if options.resume is not None and (options.odometry or options.refine_poses):
+        raise _Failure(
+            f"--resume cannot be combined with {tracking}: maps have no poses", _BAD_INPUT
+        )
     output = options.output or _OUTPUT / (place.name if place.is_dir() else place.stem)
     _check_outputs(options, output)
     if options.ground_truth is not None and not options.ground_truth.exists():
@@ -297,7 +305,16 @@ def _map(options: argparse.Namespace) -> None:
         exact_sdf=exact_sdf,
         skip_bad_frames=options.skip_bad_frames,
         resumed=resumed,
+        tracker=_tracker(options),
     )
+
+
+def _tracker(options: argparse.Namespace) -> Tracker | None:
+    if not (options.odometry or options.refine_poses):
+        return None
+    from hiosdf_jax._src.command.tracker import Tracker
+
+    return Tracker(options.odometry)
 
 
 def _view(options: argparse.Namespace) -> None:
@@ -580,10 +597,13 @@ def _run(
     except StoppedError as stop:
         if not stop.mapped:
             raise KeyboardInterrupt from stop
-        map_path = str(map_stream.map_file(output, options.save))
-        command, *rest = _without_resume(options.arguments)
-        again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
-        print(f"stopped by {stop}; to go on:\n  {again}")
+        if settings.get("tracker") is not None:
+            print(f"stopped by {stop}")
+        else:
+            map_path = str(map_stream.map_file(output, options.save))
+            command, *rest = _without_resume(options.arguments)
+            again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
+            print(f"stopped by {stop}; to go on:\n  {again}")
     if live is not None:
         _end_watch(options, live)
 
@@ -763,6 +783,18 @@ def _parser() -> argparse.ArgumentParser:
         help="score against the scene: a triangle mesh (.ply, .obj, .stl, .off or .glb) in the "
         "stream's world frame and in meters, "
         "or a folder with iSDF's sdf.npy and transform.txt",
+    )
+
+    poses = map_.add_mutually_exclusive_group()
+    poses.add_argument(
+        "--refine-poses",
+        action="store_true",
+        help="the stream's poses drift: refine each by the map so far, before the frame is fused",
+    )
+    poses.add_argument(
+        "--odometry",
+        action="store_true",
+        help="use no pose of the stream but the first: the map alone tells the others",
     )
 
     size = map_.add_argument_group("size of the map")

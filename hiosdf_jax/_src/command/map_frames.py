@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.command.progress import FrameDigest, Progress, SavedMap
+from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax._src.mapping import pipeline
@@ -76,6 +77,7 @@ def fuse_frames(
     keep: Callable[[MapState, Progress], None] | None = None,
     keep_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
+    tracker: Tracker | None = None,
     watch: Callable[[MapState, Progress, np.ndarray, np.ndarray], None] | None = None,
 ) -> Mapped:
     """Fuses the frames of a stream into a map, one by one, with a progress bar.
@@ -95,6 +97,7 @@ def fuse_frames(
         keep_every: Number of updates after which `keep` is called again.
         stop: Is asked before each frame. The mapping ends if it returns something true, whose `str`
             is the reason.
+        tracker: Refines the poses. By default they are used as the stream gives them.
         watch: Is given the map after each frame, how far it has come, and the frame: its cloud
             (N, 3) m, sensor frame, and its pose (4, 4) T_world_sensor.
 
@@ -155,16 +158,23 @@ def fuse_frames(
             continue
         digest.add(cloud, pose)
         if i in held_out:
+            if tracker is not None:
+                pose = tracker.locate(state, cloud, pose, i)
             kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
             continue
         last_frame = i
+        updates = int(state.updates)
+        start = time.perf_counter()
+        if i >= first:
+            if tracker is None:
+                state = pipeline.update(state, cloud, pose)
+            else:
+                state, pose = tracker.fuse(state, cloud, pose, i)
+            jax.block_until_ready(state)
         path_world.append(pose[:3, 3])
         ups_world.append(up_of_frame(cloud, pose))
         if i < first:
             continue
-        updates = int(state.updates)
-        start = time.perf_counter()
-        state = jax.block_until_ready(pipeline.update(state, cloud, pose))
         seconds.append(time.perf_counter() - start)
         if len(seconds) == 1:
             return_freed_memory()

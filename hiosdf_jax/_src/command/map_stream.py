@@ -16,12 +16,13 @@ from hiosdf_jax._src.command import report
 from hiosdf_jax._src.command.live_map import LiveMap
 from hiosdf_jax._src.command.map_frames import Mapped, fuse_frames, return_freed_memory
 from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
+from hiosdf_jax._src.command.tracker import TRAJECTORY, Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.mapping import checkpoint, pipeline
 from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring import held_out, metrics
 from hiosdf_jax._src.state import MapState, field_of
@@ -31,7 +32,7 @@ from hiosdf_jax._src.view.growing import Stage, save_growing
 if TYPE_CHECKING:
     import trimesh
 
-RESULTS = ("mesh.ply", "mesh.png", "slices.png", "growing.gif", "metrics.json")
+RESULTS = (*TRAJECTORY, "mesh.ply", "mesh.png", "slices.png", "growing.gif", "metrics.json")
 _STAGES = 12  # of the growing map, that growing.gif shows
 UNFINISHED = "checkpoint.npz"  # the map of a run that has not come to its end
 
@@ -51,6 +52,7 @@ def run_stream(
     resume_path: str | os.PathLike[str] | None = None,
     checkpoint_every: int | None = None,
     stop: Callable[[], object] = lambda: None,
+    tracker: Tracker | None = None,
     live: LiveMap | None = None,
     draw_growing: bool = False,
 ) -> dict[str, Any]:
@@ -82,6 +84,8 @@ def run_stream(
             run is renamed before one that is not finished takes its place.
         checkpoint_every: Number of updates after which the map is written again.
         stop: Is asked before each frame, and ends the mapping by returning something true.
+        tracker: Refines the poses, and writes the trajectory. Such a run cannot be resumed: the
+            file of the map has no poses.
         live: Shows the map while it grows.
         draw_growing: Draw `growing.gif`, too; with the default configuration it takes about a
             second for each of 12 pictures.
@@ -107,7 +111,10 @@ def run_stream(
         place = map_path.resolve()
         if place not in ours and progress.next_frame < len(stream):
             _set_aside(place)
-        save_map(map_path, SavedMap(state, progress, seed, truth is None))
+        if tracker is None:
+            save_map(map_path, SavedMap(state, progress, seed, truth is None))
+        else:
+            checkpoint.save(map_path, state)
         ours.add(place)
         return map_path
 
@@ -144,6 +151,7 @@ def run_stream(
         keep=keep,
         keep_every=checkpoint_every,
         stop=stop,
+        tracker=tracker,
         watch=watch,
     )
     if save_path is not None or mapped.stopped is not None:
@@ -169,6 +177,9 @@ def run_stream(
             save_growing(folder / "growing.gif", stages, up_world)
         described = report.describe(mapped, config) | {"stream": name, "seed": seed} | scores
         described["up_world"] = up_world.tolist()
+        if tracker is not None:
+            described |= tracker.counts()
+            tracker.write(folder, up_world)
         described["total_s"] = time.perf_counter() - start
         report.write_json(folder / "metrics.json", described)
     print(report.summarize(described))

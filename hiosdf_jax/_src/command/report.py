@@ -25,6 +25,7 @@ FLAG_WORDS = {
     Flag.OUT_OF_RANGE: "a cloud had almost no return in range and was refused: is its unit m?",
     Flag.INCONSISTENT_CLOUD: "a cloud contradicted the map: check the pose and the sensor",
     Flag.BAD_ARGUMENT: "the robot's spheres or the noise had bad values",
+    Flag.NOT_REGISTERED: "a cloud did not fit the map at any pose near its own, and was left out",
 }
 
 
@@ -73,6 +74,9 @@ def summarize(metrics: dict[str, Any]) -> str:
     lines = [f"{metrics['updates']} updates on {metrics['device']}: {', '.join(measured)}"]
     if metrics["frames_skipped"]:
         lines.append(f"{metrics['frames_skipped']} frames could not be used and were skipped")
+    if "frames_registered" in metrics:
+        missed = metrics["frames_not_registered"]
+        lines.append(f"{metrics['frames_registered']} poses were refined, {missed} were not")
     if metrics["stopped_by"]:
         lines.append(f"ended early by {metrics['stopped_by']}")
     for flag in metrics["flags"]:

@@ -51,6 +51,11 @@ _MOVED_VOXELS = 0.5
 _MOVED_COSINE = 0.7
 _MOVED_SOFT_VOXELS = 0.3
 
+# For registration, patches count by 1 / e less for each of the first distance, and up to about 45
+# degrees off.
+_PLANE_VOXELS = 0.5
+_PLANE_COSINE = 0.7
+
 # A voxel is either observed or not, even where its distance to the frontier is 0, m.
 _LEAST_FRONTIER = 1e-6
 
@@ -103,6 +108,69 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     sdf_m = jnp.sum(weight * value, axis=0) / total * config.voxel_size
     spread_m = jnp.sum(weight * patch.spread, axis=0) / total * config.voxel_size
     return Nearest(jnp.where(any_found, sdf_m, config.distance_horizon), spread_m)
+
+
+class Plane(NamedTuple):
+    """The planes of the patches near points.
+
+    Attributes:
+        height: Of the point above the plane, on the sensor's side, (N,) m.
+        normal: Unit vectors, (N, 3).
+        beside: How far the point is from the patches' middle along the plane, (N,) m.
+        width: The patches' standard deviation along their shorter side, (N,) m.
+        spread: As in `Nearest`, (N,) m.
+        away: Distance to the nearest patch, (N,) m; inf where none is within the horizon.
+    """
+
+    height: jax.Array
+    normal: jax.Array
+    beside: jax.Array
+    width: jax.Array
+    spread: jax.Array
+    away: jax.Array
+
+
+def nearest_plane(config: Config, surface: Surface, points_world: jax.Array) -> Plane:
+    """Finds the mean plane of the patches near points, to register clouds.
+
+    The normal of a patch that was hit a few times is noise. The mean of eight is less so, and
+    larger patches count more.
+
+    Args:
+        config: The map's configuration.
+        surface: The grid's surface.
+        points_world: (N, 3) m; points outside the bounds take the border's value.
+
+    Returns:
+        The planes. Differentiable by the points and the patches, with the patches' weights fixed.
+    """
+    points_world = geometry.clamp(config, points_world)
+    corners = geometry.corners_of(config, points_world)
+    patch = _patches_at(config, surface, corners, points_world)
+    away = jnp.where(patch.found, patch.distance, jnp.inf)
+    nearest = jnp.argmin(away, axis=0)[None]
+    along = dot(patch.normal, each(lambda n: jnp.take_along_axis(n, nearest, 0), patch.normal))
+    nearness = jnp.exp(jnp.minimum(jnp.min(away, axis=0) - patch.distance, 0) / _PLANE_VOXELS)
+    weight = jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness * patch.area
+    weight = jnp.where(patch.found & (along > _PLANE_COSINE), weight, 0)
+    share = jax.lax.stop_gradient(weight / jnp.maximum(jnp.sum(weight, axis=0), 1e-12))
+
+    def mean(values: jax.Array) -> jax.Array:
+        return jnp.sum(share * values, axis=0)
+
+    normal = unit(each(mean, patch.normal))
+    offset = each(mean, patch.offset)
+    height = dot(normal, offset)
+    beside = length(each(lambda o, n: o - height * n, offset, normal))
+    voxel = config.voxel_size
+    return Plane(
+        height=voxel * height,
+        normal=join(normal),
+        beside=voxel * beside,
+        width=voxel * mean(patch.width),
+        spread=voxel * mean(patch.spread),
+        away=voxel * jnp.min(away, axis=0),
+    )
 
 
 class OnSurface(NamedTuple):
@@ -160,7 +228,9 @@ class _Patches(NamedTuple):
     found: jax.Array  # bool
     distance: jax.Array  # 0 where none was found
     height: jax.Array  # above the plane, positive on the sensor's side
+    offset: Vector  # of the point from the patch's mean
     normal: Vector
+    width: jax.Array  # standard deviation of the hits along the shorter side of the patch
     area: jax.Array  # variance of the hits in the plane, voxels^2
     spread: jax.Array
 
@@ -190,8 +260,11 @@ def _patches_at(
     step = each(jnp.subtract, point, fixed)
     direction = each(lambda o: o / jnp.maximum(away, 1e-9), offset)
     distance = away + dot(direction, step)
-    height = dot(each(jnp.subtract, point, mean), normal)
-    return _Patches(found, jnp.where(found, distance, 0), height, normal, length(across), spread)
+    above = each(jnp.subtract, point, mean)
+    height = dot(above, normal)
+    distance = jnp.where(found, distance, 0)
+    width = length(take(axes, row, 3))
+    return _Patches(found, distance, height, above, normal, width, length(across), spread)
 
 
 def _signed(patch: _Patches, side: jax.Array, own: jax.Array) -> jax.Array:

@@ -21,7 +21,7 @@ from hiosdf_jax._src.mapping.stages import (
     run_stages,
 )
 from hiosdf_jax._src.network.training import init_network
-from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.arrays import on_device, scalar
 from hiosdf_jax._src.numerics.intake import as_array, as_key, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.posed_cloud import (
@@ -138,14 +138,33 @@ def update(
     check_map(state)
     extras = check_extras(robot, noise)
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
-        return _update(state, *as_traced(cloud, pose), *extras)
-    compiled = _update_donating if donate else _update_jit
+        return trace_update(state, *as_traced(cloud, pose), *extras)
     config = state.config
     cloud, pose = prepare(cloud, pose, config.max_points)
     limits = (config.min_range, config.max_range, config.min_in_range)
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
-    return compiled(state, jax.device_put(cloud), jax.device_put(pose), *extras)
+    return run_update(state, cloud, pose, extras, scalar(0, np.uint32), donate)
+
+
+def run_update(
+    state: MapState, cloud: Any, pose: Any, extras: Any, raised: jax.Array, donate: bool
+) -> MapState:
+    """Runs the compiled update, the same one for `update` and for tracking.
+
+    Args:
+        state: The map so far.
+        cloud: (max_points, 3) float32, checked and padded.
+        pose: (4, 4) float32.
+        extras: `robot` and `noise`, checked.
+        raised: Flags that refuse the cloud already, () uint32.
+        donate: As for `update`.
+
+    Returns:
+        The new map.
+    """
+    compiled = _update_donating if donate else _update_jit
+    return compiled(state, jax.device_put(cloud), jax.device_put(pose), *extras, raised)
 
 
 def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
@@ -242,17 +261,19 @@ def grow(state: MapState, bounds: Any) -> MapState:
 
 
 @plain
-def _update(
+def trace_update(
     state: MapState,
     cloud: jax.Array,
     pose: jax.Array,
     robot: tuple[jax.Array, jax.Array] | None = None,
     noise: jax.Array | None = None,
+    raised: jax.Array | int = 0,
 ) -> MapState:
+    """Updates a map inside jit, where shapes are used as they are; see `run_update`."""
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    step = run_stages(begin(state, cloud, finite, pose, robot, noise), CHECKS)
+    step = run_stages(begin(state, cloud, finite, pose, robot, noise, raised), CHECKS)
     return cond(
         is_accepted(step),
         lambda _, step: run_stages(step, FUSION).state,
@@ -262,6 +283,6 @@ def _update(
     )
 
 
-_update_jit = jax.jit(_update)
+_update_jit = jax.jit(trace_update)
 # Also leaves that an update does not read are donated.
-_update_donating = jax.jit(_update, donate_argnums=0, keep_unused=True)
+_update_donating = jax.jit(trace_update, donate_argnums=0, keep_unused=True)

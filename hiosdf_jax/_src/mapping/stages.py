@@ -99,11 +99,11 @@ def begin(
     pose: jax.Array,
     robot: tuple[jax.Array, jax.Array] | None = None,
     noise: jax.Array | None = None,
+    raised: jax.Array | int = 0,
 ) -> Step:
-    """Starts an update: draws its keys and stores the next one in the map."""
-    flags = jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD) | jnp.where(
-        is_rigid(pose), 0, Flag.BAD_POSE
-    )
+    """Starts an update: draws its keys, stores the next one in the map, adds to flags raised."""
+    flags = raised | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD)
+    flags |= jnp.where(is_rigid(pose), 0, Flag.BAD_POSE)
     flags |= jnp.where(extras_are_valid(robot, noise), 0, Flag.BAD_ARGUMENT)
     key, grid_key, cloud_key, order_key, bound_key = jax.random.split(state.key, 5)
     keys = Keys(bound=bound_key, grid=grid_key, cloud=cloud_key, order=order_key)
@@ -294,6 +294,7 @@ def run_stages(step: Step, stages: Sequence[Stage]) -> Step:
 def is_accepted(step: Step) -> jax.Array:
     """Returns whether the checked cloud is to be fused, () bool."""
     refused = Flag.BAD_POSE | Flag.EMPTY_CLOUD | Flag.OUT_OF_RANGE | Flag.BAD_ARGUMENT
+    refused |= Flag.NOT_REGISTERED
     most = step.config.most_refusals
     # Random points are refused however often they come: no pose explains them.
     patient = (step.state.report.refused_in_row < most) | (step.novelty.noise & (most > 0))

@@ -18,19 +18,25 @@ from hiosdf_jax._src.state import Baked, Field
 INLIER_DEVIATIONS = 3.0
 """The weight of a return falls to a quarter at this many standard deviations."""
 
-# No patch is known better than this, m.
-_LEAST_SIGMA_M = 0.005
+# No patch is known better than this, m, and no return across its ray better than this, rad: pixels
+# and beams are that wide. Without it distant surfaces at grazing angles count too much.
+_LEAST_SIGMA_M = 0.006
+_ACROSS_RAD = 0.002
 
-# Returns this deep in unseen space are compared, m, and this many coarse scales.
+# Returns this deep in unseen space are compared, m, and this many times what a coarse scale has
+# above the other length, m. Smaller scales track a sensor in a map that still grows: there, a
+# return in unseen space is of a surface that the map does not have.
 _DEEPEST_M = 0.1
 _DEEPEST_SCALES = 2.0
+_TRACKING_M = 0.2
 
 # A direction is free if the returns fit about as well where they are moved this far along it, m: if
 # their mean loss, which is at most 1, grows by less than this. Its slope alone does not tell: noise
-# turns the normals of patches. At exact poses it grows along a corridor by at most 0.002, and in a
-# furnished house by at least 0.012. Coarse steps that drift along a corridor raise it to 0.01.
+# turns the normals of patches. In maps of corridors it grows by at most 0.0035 along them, and in a
+# furnished house by at least 0.0069. A baked field does not know how noisy it is.
 _TRIED_M = 0.2
-_LEAST_GROWTH = 0.01
+_LEAST_GROWTH = 0.004
+_LEAST_GROWTH_BAKED = 0.01
 
 # As many of the least determined directions are tried: a plane leaves three free.
 _TRIED_DIRECTIONS = 3
@@ -70,6 +76,7 @@ class Residuals(NamedTuple):
         jacobian: Their derivative by the motion, (N, 6).
         sigma: Standard deviation of each, (N,) m.
         comparable: The map has observed the place, (N,) bool.
+        contrary: The map has seen it empty, (N,) bool.
         weight: Inverse variance, less for outliers, 0 where nothing can be compared, (N,).
         points_world: (N, 3) m.
     """
@@ -78,6 +85,7 @@ class Residuals(NamedTuple):
     jacobian: jax.Array
     sigma: jax.Array
     comparable: jax.Array
+    contrary: jax.Array
     weight: jax.Array
     points_world: jax.Array
 
@@ -149,20 +157,22 @@ def compare(
     """
     offset = jnp.sum(rows.points[:, None, :] * pose[:3, :3], axis=-1)
     points_world = offset + pose[:3, 3]
-    match = match_points(field, points_world)
-    # Only the part of the range's error along the normal counts.
+    match = match_points(field, points_world, rows.some)
+    # Only the part of the error along the normal counts.
     square = jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-6)
-    across = jnp.sum(match.normal * offset, axis=-1) ** 2 / square
-    variance = across * rows.sigma**2 + match.spread**2 + _LEAST_SIGMA_M**2
+    along = jnp.minimum(jnp.sum(match.normal * offset, axis=-1) ** 2 / square, 1)
+    variance = along * rows.sigma**2 + (1 - along) * _ACROSS_RAD**2 * square
+    variance += match.spread**2 + _LEAST_SIGMA_M**2
     comparable = rows.some & match.usable
-    comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * scale_m)
+    comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - _TRACKING_M))
     sigma = jnp.sqrt(variance + (scale_m / INLIER_DEVIATIONS) ** 2)
     # The function of Geman and McClure.
     ratio = match.distance / (INLIER_DEVIATIONS * sigma)
     weight = jnp.where(comparable, 1 / (sigma * (1 + ratio**2)) ** 2, 0)
     turn = jnp.cross(offset, match.normal) / rows.length
     jacobian = jnp.concatenate([match.normal, turn], axis=-1)
-    return Residuals(match.distance, jacobian, sigma, comparable, weight, points_world)
+    contrary = rows.some & match.empty
+    return Residuals(match.distance, jacobian, sigma, comparable, contrary, weight, points_world)
 
 
 def information_of(residuals: Residuals) -> jax.Array:
@@ -207,12 +217,15 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
 
     def growth(motion: jax.Array) -> jax.Array:
         there = compare(field, rows, move(pose, motion), 0.0)
-        more = jnp.where(here.comparable, _loss(there) - _loss(here), 0)
-        return jnp.sum(more) / jnp.maximum(jnp.sum(here.comparable), 1)
+        # Returns that come to where the map ends tell nothing.
+        both = here.comparable & there.comparable
+        more = jnp.where(both, _loss(there) - _loss(here), 0)
+        return jnp.sum(more) / jnp.maximum(jnp.sum(both), 1)
 
     way = _TRIED_M * basis.T[:_TRIED_DIRECTIONS] / units(rows)
     grown = jax.lax.map(growth, jnp.concatenate([way, -way])).reshape(2, -1)
-    free = ~(jnp.min(grown, axis=0) >= _LEAST_GROWTH)
+    least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
+    free = ~(jnp.min(grown, axis=0) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
     return Directions(basis, free | ~jnp.any(here.comparable))
 

@@ -15,6 +15,23 @@ from hiosdf_jax._src.state import Baked, Field
 # A gradient that is shorter than this lies between surfaces and has no direction.
 _LEAST_SLOPE = 0.5
 
+# Points farther from a patch along its plane are beside the surface that is known so far. They
+# would pull a cloud back to where the map ends. Narrower patches show no normal.
+_MOST_BESIDE_VOXELS = 0.8
+_LEAST_WIDTH_VOXELS = 0.1
+
+# Patches that were hit a few times are narrow, and points beside them lie on the same surface. Up
+# to the first mean width of a cloud's patches, voxels, distances are those from planes. From the
+# second one on they are those of the map, which find poses twice as exactly in a house. Its width
+# is 0.21 after the first frame of 77,000 points, and 0.23 to 0.26 in the end. In a room of 300
+# points a frame it is 0.16 to 0.19.
+_NARROW_VOXELS = 0.20
+_WIDE_VOXELS = 0.22
+
+# A return contradicts the map if it is this far inside observed space, and this far from patches.
+_FREE_VOXELS = 0.5
+_EMPTY_VOXELS = 1.5
+
 # The error of trilinear interpolation near surfaces, as a share of the samples' spacing.
 _BAKED_SPREAD = 0.05
 
@@ -28,6 +45,7 @@ class Match(NamedTuple):
         spread: Standard deviation of the surface there, (N,) m.
         depth: How far the point lies in unseen space, (N,) m; negative in observed space.
         usable: The map has a surface near the point, (N,) bool.
+        empty: The map has seen the place, and no surface there, (N,) bool.
     """
 
     distance: jax.Array
@@ -35,9 +53,10 @@ class Match(NamedTuple):
     spread: jax.Array
     depth: jax.Array
     usable: jax.Array
+    empty: jax.Array
 
 
-def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
+def match_points(field: Field | Baked, points_world: jax.Array, some: jax.Array) -> Match:
     """Compares points with a map.
 
     A live map answers by its grid alone: the network changes no surface and costs more.
@@ -45,6 +64,7 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
     Args:
         field: The map.
         points_world: (N, 3) m, finite.
+        some: The row is a point, (N,) bool.
 
     Returns:
         The comparison. Differentiable by the points.
@@ -56,6 +76,7 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
         # `bake` takes half a cell's diagonal off the frontier.
         depth = depth - 3**0.5 / 2 * field.resolution
         inside = jnp.ones(distance.shape, bool)
+        empty = jnp.zeros(distance.shape, bool)  # all points are usable
     else:
         config, surface = field.config, field.surface
 
@@ -65,11 +86,26 @@ def match_points(field: Field | Baked, points_world: jax.Array) -> Match:
 
         distance, pull, spread = jax.vjp(nearest, points_world, has_aux=True)
         (normal,) = pull(jnp.ones_like(distance))
+        plane = lookup.nearest_plane(config, surface, points_world)
         depth = -lookup.frontier_distance(config, surface, geometry.clamp(config, points_world))
         inside = jnp.all(points_world == geometry.clamp(config, points_world), axis=-1)
-        inside &= jnp.abs(distance) < 0.99 * config.distance_horizon
+        free = depth < -_FREE_VOXELS * config.voxel_size
+        empty = inside & free & (plane.away > _EMPTY_VOXELS * config.voxel_size)
+        inside &= plane.beside < _MOST_BESIDE_VOXELS * config.voxel_size
+        inside &= plane.width > _LEAST_WIDTH_VOXELS * config.voxel_size
+        share = _share_of_map(plane.width / config.voxel_size, some & inside)
+        distance = share * distance + (1 - share) * plane.height
+        normal = share * normal + (1 - share) * plane.normal
+        spread = share * spread + (1 - share) * plane.spread
     steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
-    return Match(distance, normal, spread, depth, inside & steep)
+    return Match(distance, normal, spread, depth, inside & steep, empty)
+
+
+def _share_of_map(width: jax.Array, usable: jax.Array) -> jax.Array:
+    """How far distances are the map's own, not those from planes: from 0 to 1, for all points."""
+    total = jnp.sum(jnp.where(usable, jax.lax.stop_gradient(width), 0))
+    mean = total / jnp.maximum(jnp.sum(usable), 1)
+    return jnp.clip((mean - _NARROW_VOXELS) / (_WIDE_VOXELS - _NARROW_VOXELS), 0, 1)
 
 
 def noise_of(field: Field | Baked) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import (
+    FINE_START_M,
     differentiable,
     select_rows,
     solve_coarse,
@@ -28,7 +29,8 @@ from hiosdf_jax._src.mapping.registration.solving import (
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, inflation_of
-from hiosdf_jax._src.numerics.intake import as_floats, is_traced
+from hiosdf_jax._src.numerics.arrays import scalar
+from hiosdf_jax._src.numerics.intake import as_floats, as_number, is_traced
 from hiosdf_jax._src.numerics.posed_cloud import (
     as_traced,
     check_extras,
@@ -75,6 +77,7 @@ def refine_pose(
     prior: tuple[Any, Any] | None = None,
     *,
     noise: tuple[Any, Any] | None = None,
+    reach_m: Any = 0.7,
 ) -> Registration:
     """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
 
@@ -91,6 +94,9 @@ def refine_pose(
             not determine stay as in `pose`.
         noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m. By
             default it is `Config.range_noise` of the map; of a baked field, the default's.
+        reach_m: How far surfaces may be from where they should be, m. The default suits a map that
+            is complete. In one that grows, a wrong surface may be nearer than one that is missing:
+            `track` takes less.
 
     Returns:
         The refined pose, and how far it can be trusted.
@@ -108,15 +114,16 @@ def refine_pose(
     field = as_field(field)
     prior = _checked_prior(prior)
     _, checked_noise = check_extras(None, noise)
-    if is_traced(*jax.tree.leaves((field, prior, checked_noise)), cloud, pose):
-        return _refine(field, *as_traced(cloud, pose), prior, checked_noise)
+    reach = checked_reach(reach_m)
+    if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
+        return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach)
     floats = checked_cloud(cloud)
     finite_rows(floats)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
     rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
     padded = np.full((rows, 3), np.nan, np.float32)
     padded[: len(floats)] = floats
-    return _refine_jit(field, padded, check_pose(pose), prior, checked_noise)
+    return _refine_jit(field, padded, check_pose(pose), prior, checked_noise, reach)
 
 
 def _refine(
@@ -125,6 +132,7 @@ def _refine(
     pose: jax.Array,
     prior: tuple[jax.Array, jax.Array] | None,
     noise: jax.Array | None,
+    reach_m: jax.Array,
 ) -> Registration:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     if cloud.shape[0] == 0:
@@ -139,24 +147,25 @@ def _refine(
         anchor = Anchor(mean, jnp.linalg.inv(per_unit[:, None] * covariance * per_unit))
 
     still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
-    near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held)
+    near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held, reach_m)
     index, directions = select_rows(still, frozen, near)
     chosen = take_rows(frozen, index)
-    found, finished = solve_fine(still, chosen, near, directions, held, 1.0)
+    found, finished = solve_fine(still, chosen, near, directions, held, 1.0, FINE_START_M)
     inflation = jnp.float32(1)
     if prior is not None:
         # The prior counts by its covariance, so returns must not count as independent of each
         # other.
         inflation = inflation_of(compare(still, chosen, found, 0.0), directions)
-        found, finished = solve_fine(still, chosen, found, directions, held, inflation)
+        found, finished = solve_fine(still, chosen, found, directions, held, inflation, 0.0)
     covariance = covariance_of(compare(still, chosen, found, 0.0), directions, held, rows)
 
     even = take_evenly(frozen)
     seen = compare(still, even, found, 0.0)
     fits = seen.comparable & (jnp.abs(seen.distance) < INLIER_DEVIATIONS * seen.sigma)
+    judged = seen.comparable | seen.contrary
     count, comparable, total = (jnp.sum(part) for part in (fits, seen.comparable, even.some))
     square = jnp.sum(jnp.where(fits, seen.distance**2, 0)) / jnp.maximum(count, 1)
-    inliers = count / jnp.maximum(comparable, 1)
+    inliers = count / jnp.maximum(jnp.sum(judged), 1)
     enough = comparable >= jnp.maximum(_LEAST_COMPARABLE * total, 1)
     finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
     exact = differentiable(field, take_rows(rows, index), found, directions, anchor, inflation)
@@ -170,6 +179,15 @@ def _refine(
 
 
 _refine_jit = jax.jit(_refine)
+
+
+def checked_reach(reach_m: Any) -> jax.Array:
+    """Checks the argument `reach_m`, of tracers only the shape, and returns it as () float32."""
+    if not is_traced(reach_m):
+        return scalar(as_number("reach_m", reach_m, 0.0, above=True))
+    if np.shape(reach_m) != ():
+        raise ValueError(f"reach_m has shape {np.shape(reach_m)}, expected one number")
+    return jnp.asarray(reach_m, jnp.float32)
 
 
 def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:

@@ -24,13 +24,16 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     count = min(count, cloud.shape[0])
     rank = jnp.cumsum(finite)
     total = rank[-1]
-    steps = jnp.arange(count, dtype=jnp.float32)
-    # With fewer returns than rows, each is selected once.
-    wanted = jnp.where(total > count, jnp.floor(steps * (total / count)), steps)
-    row = jnp.searchsorted(rank, wanted.astype(rank.dtype) + 1)
-    some = steps < total
+    row = jnp.searchsorted(rank, even_steps(total, count).astype(rank.dtype) + 1)
+    some = jnp.arange(count) < total
     row = jnp.where(some, jnp.minimum(row, cloud.shape[0] - 1), 0)
     return jnp.where(some[:, None], cloud[row], 0), some
+
+
+def even_steps(total: jax.Array, count: int) -> jax.Array:
+    """Returns `count` numbers below `total` at even steps, or 0 to `count` - 1 if it is smaller."""
+    steps = jnp.arange(count, dtype=jnp.float32)
+    return jnp.where(total > count, jnp.floor(steps * (total / count)), steps)
 
 
 def draw_informative(

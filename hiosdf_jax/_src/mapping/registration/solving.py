@@ -21,31 +21,44 @@ from hiosdf_jax._src.mapping.registration.equations import (
     take_rows,
 )
 from hiosdf_jax._src.mapping.registration.motion import move
-from hiosdf_jax._src.mapping.registration.selection import draw_informative
+from hiosdf_jax._src.mapping.registration.selection import draw_informative, even_steps
 from hiosdf_jax._src.state import Baked, Field
 
-# Surfaces may be this far from where they should be in the first and in the last coarse step, m.
-# Smaller first scales lose poses that are 15 cm and 6 degrees off; fewer steps do not suffice
-# along directions in which few returns tell anything.
-_COARSE_M = (0.7, 0.03)
+# Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
+# suffice along directions in which few returns tell anything.
+_COARSE_END_M = 0.03
 _COARSE_STEPS = 24
 _COARSE_ROWS = 1024
 _DAMPING = 1e-5
 
+# So many returns tell as much as one independent one. Against a prior, coarse steps must not trust
+# them more: their noisy normals tell of directions of which the surfaces tell nothing.
+_COARSE_INFLATION = 16.0
+
+# Rows are selected where surfaces may be this far off, m: those that contradict a pose that is not
+# yet right must be among them. Fine steps begin with a smaller tolerance, m, and shrink it by a
+# factor in each step.
+_SELECTED_M = 0.1
+FINE_START_M = 0.06
+_FINE_SHRINK = 0.7
+_FINE_END_M = 0.004  # no tolerance below
+
 _FINE_STEPS = 24
-_WHOLE_STEPS = 8  # half steps then: the distance has kinks, around which whole ones may jump
+_WHOLE_STEPS = 16  # half steps then: the distance has kinks, around which whole ones may jump
 _FINE_ROWS = 2048
 _FINISHED_M = 5e-6
 _RESTING_M = 2e-3
 
 
-def take_evenly(rows: Rows) -> Rows:
-    """Selects rows at even steps, as many as coarse steps use."""
-    every = max(rows.points.shape[0] // _COARSE_ROWS, 1)
-    return take_rows(rows, slice(None, None, every))
+def take_evenly(rows: Rows, count: int = _COARSE_ROWS) -> Rows:
+    """Selects returns at even steps, or all if there are fewer; the rows begin with the returns."""
+    count = min(count, rows.points.shape[0])
+    return take_rows(rows, even_steps(jnp.sum(rows.some), count).astype(jnp.int32))
 
 
-def solve_coarse(field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anchor) -> jax.Array:
+def solve_coarse(
+    field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anchor, reach_m: jax.Array | float
+) -> jax.Array:
     """Brings a pose near the solution, with a tolerance that shrinks from step to step.
 
     Args:
@@ -53,19 +66,21 @@ def solve_coarse(field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anch
         rows: The returns.
         pose: (4, 4), where to begin.
         anchor: What holds free directions.
+        reach_m: How far surfaces may be from where they should be in the first step.
 
     Returns:
         (4, 4).
     """
     few = take_evenly(rows)
-    first, last = _COARSE_M
+    shrink = _COARSE_END_M / reach_m
     # Fine steps bring free directions back.
     axes = no_free_directions()
 
     def step(i: jax.Array, pose: jax.Array) -> jax.Array:
-        scale_m = first * (last / first) ** (i / (_COARSE_STEPS - 1))
+        scale_m = reach_m * shrink ** (i / (_COARSE_STEPS - 1))
         residuals = compare(field, few, pose, scale_m)
-        return move(pose, find_step(residuals, axes, anchor, few, pose, damping=_DAMPING))
+        motion = find_step(residuals, axes, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
+        return move(pose, motion)
 
     return jax.lax.fori_loop(0, _COARSE_STEPS, step, pose)
 
@@ -79,20 +94,22 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
         pose: (4, 4), near the solution.
 
     Returns:
-        Indices of rows, at most as many as fine steps use, all of them if there are no more; and
+        Indices of rows, at most as many as fine steps use, all returns if there are no more; and
         the principal directions of the returns.
     """
     directions = find_directions(field, take_evenly(rows), pose)
     if rows.points.shape[0] <= _FINE_ROWS:
         return jnp.arange(rows.points.shape[0]), directions
-    residuals = compare(field, rows, pose, 0.0)
+    whole = jnp.arange(_FINE_ROWS, dtype=jnp.int32)
+    residuals = compare(field, rows, pose, _SELECTED_M)
     information = information_of(residuals)
     # Free directions must not draw all rows.
     held = jnp.where(directions.free, jnp.trace(information), 0)
     information += (directions.basis * held) @ directions.basis.T
     information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6)
     row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
-    return row, directions
+    # A small cloud that is padded gives the same pose as without padding.
+    return jnp.where(jnp.sum(rows.some) <= _FINE_ROWS, whole, row), directions
 
 
 def solve_fine(
@@ -102,6 +119,7 @@ def solve_fine(
     directions: Directions,
     anchor: Anchor,
     inflation: jax.Array | float,
+    start_m: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Steps until the pose stays where it is.
 
@@ -112,14 +130,19 @@ def solve_fine(
         directions: Principal directions, some of them free.
         anchor: What holds free directions.
         inflation: How many returns tell as much as one independent one would.
+        start_m: How far surfaces may be from where they should be in the first step.
 
     Returns:
         The pose (4, 4), and whether the last step was short, () bool.
     """
 
+    def tolerance(count: jax.Array) -> jax.Array:
+        scale_m = start_m * _FINE_SHRINK**count
+        return jnp.where(scale_m > _FINE_END_M, scale_m, 0)
+
     def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
         pose, _, count = carry
-        residuals = compare(field, rows, pose, 0.0)
+        residuals = compare(field, rows, pose, tolerance(count))
         motion = find_step(residuals, directions, anchor, rows, pose, inflation)
         way = jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
         motion = jnp.where(count < _WHOLE_STEPS, 1, 0.5) * motion
@@ -127,7 +150,8 @@ def solve_fine(
 
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         _, way, count = carry
-        return (count < _FINE_STEPS) & ~(way <= _FINISHED_M)
+        rests = (way <= _FINISHED_M) & (tolerance(count) == 0)
+        return (count < _FINE_STEPS) & ~rests
 
     start = (pose, jnp.float32(jnp.inf), jnp.int32(0))
     pose, way, _ = jax.lax.while_loop(goes_on, step, start)

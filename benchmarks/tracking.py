@@ -1,0 +1,151 @@
+"""Maps streams whose poses drift, jump or are missing, and finds frames in a finished map.
+
+    python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --poses jitter
+    python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --poses none
+    python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --relocalize 100
+
+`--poses` says what is done to the stream's poses before they are refined:
+
+- `exact`, `jitter unrefined`: nothing, or as below; the poses are not refined
+- `jitter`: each is off by 2 cm and 1 degree, in random directions
+- `jitter known`: the same, and each is a prior with that standard deviation
+- `glitch`: five of them are off by 1 m
+- `none`: only the first is used
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import hiosdf_jax as hio
+from benchmarks.registration import error, perturb
+from hiosdf_jax import datasets, scoring
+from hiosdf_jax._src.command.tracker import Tracker
+from hiosdf_jax._src.field.compiled import CompiledQueries
+
+MODES = ("exact", "jitter unrefined", "jitter", "jitter known", "glitch", "none")
+JITTER = 0.02, 1.0  # m, degrees
+GLITCH = range(60, 65)
+
+# A frame counts as found within this, m and degrees.
+FOUND = 0.05, 1.0
+
+
+def change(exact, mode):
+    """Returns the poses that a stream has, made worse."""
+    given = [np.array(pose) for pose in exact]
+    if mode.startswith("jitter"):
+        rng = np.random.default_rng(0)
+        given[1:] = [perturb(pose, rng, *JITTER) for pose in exact[1:]]
+    if mode == "glitch":
+        for i in GLITCH:
+            given[i][:3, 3] += [0.6, 0.8, 0]
+    return given
+
+
+def map_stream(frames, config, mode):
+    """Maps frames; returns the map, the poses at which they were fused, and who was refused."""
+    given = change([pose for _, pose in frames], mode)
+    deviation = np.repeat([JITTER[0], np.radians(JITTER[1])], 3) / 3**0.5
+    prior = np.diag(deviation**2).astype(np.float32)
+    tracker = Tracker(odometry=mode == "none")
+    state = hio.init(config, jax.random.key(0))
+    poses, refused = [], []
+    for i, (cloud, _) in enumerate(frames):
+        pose, fused = given[i], True
+        if mode in ("exact", "jitter unrefined"):
+            state = hio.update(state, cloud, pose)
+        elif mode.startswith("jitter"):
+            known = (pose, prior) if mode == "jitter known" else None
+            state, found = hio.track(state, cloud, pose, known)
+            pose, fused = found.pose, bool(found.converged)
+        else:
+            state, pose = tracker.fuse(state, cloud, pose, i)
+            fused = tracker.frames[-1].registered
+        poses.append(np.asarray(pose))
+        if not fused:
+            refused.append(i)
+    return state, poses, refused
+
+
+def print_tracking(stream, frames, config, truth, mode):
+    """Maps a stream and prints the errors of the poses and of the map."""
+    begin = time.perf_counter()
+    state, poses, refused = map_stream(frames, config, mode)
+    exact = [pose for _, pose in frames]
+    away = np.stack([error(a, b) for a, b in zip(poses, exact, strict=True)])
+    way = 100 * np.linalg.norm(away[:, :3], axis=1)
+    angle = np.degrees(np.linalg.norm(away[:, 3:], axis=1))
+    print(
+        f"{stream}, {mode}: poses off by {np.sqrt(np.mean(way**2)):.2f} cm (root mean square), "
+        f"{way.max():.2f} cm (most), {way[-1]:.2f} cm and {angle[-1]:.2f} deg (end); "
+        f"not registered: {refused}; {time.perf_counter() - begin:.0f} s"
+    )
+    if truth is not None:
+        queries = CompiledQueries(hio.snapshot(state))
+        scores = scoring.evaluate(queries.sdf_and_grad, truth, last_frame=len(frames) - 1)
+        print(f"map error {scores['visible_cm']:.3f} cm")
+
+
+def print_relocalization(stream, frames, state, count, up_world):
+    """Finds frames in a map, and prints how many were found and those that were not."""
+    rng = np.random.default_rng(0)
+    field, seconds, good = hio.snapshot(state), [], 0
+    picks = rng.permutation(len(frames))[:count]
+    for k, i in enumerate(picks):
+        cloud, pose = frames[i]
+        # An accelerometer that is off by a degree.
+        tilt = perturb(np.eye(4), rng, 0.0, 1.0)[:3, :3]
+        up_sensor = tilt @ pose[:3, :3].T @ up_world
+        begin = time.perf_counter()
+        place = hio.relocalize(
+            field, cloud, jax.random.key(k), up_sensor=up_sensor, up_world=up_world
+        )
+        jax.block_until_ready(place)
+        seconds.append(time.perf_counter() - begin)
+        away = error(place.best.pose, pose)
+        way, angle = np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))
+        if way < FOUND[0] and angle < FOUND[1]:
+            good += 1
+        else:
+            print(
+                f"frame {i}: {way:.2f} m and {angle:.1f} deg off, score {float(place.score):.2f}, "
+                f"other {float(place.other_score):.2f}"
+            )
+    print(f"{stream}: {good} of {len(picks)} found, {np.median(seconds[1:]):.2f} s each (median)")
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Tracks streams and relocalizes frames.")
+    parser.add_argument("--stream", type=Path, required=True, help="a recording")
+    parser.add_argument("--poses", choices=MODES, nargs="*", default=[], help="see above")
+    parser.add_argument("--relocalize", type=int, default=0, help="frames to find")
+    parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
+    parser.add_argument("--frames", type=int, help="use only the first ones")
+    arguments = parser.parse_args()
+    stream = datasets.open_stream(arguments.stream)
+    bounds, max_range = datasets.find_bounds(stream)
+    config = hio.Config.light(bounds, max_range=max_range)
+    frames = [stream[i] for i in range(arguments.frames or len(stream))]
+    truth = datasets.read_truth(arguments.stream)
+    name = arguments.stream.stem
+    for mode in arguments.poses:
+        print_tracking(name, frames, config, truth, mode)
+    if arguments.relocalize:
+        if arguments.map:
+            state = hio.load(arguments.map)
+        else:
+            state = map_stream(frames, config, "exact")[0]
+        with np.load(arguments.stream) as file:
+            up_world = file["floor_normal"] if "floor_normal" in file else np.array([0, 0, 1.0])
+        up_world = up_world * np.sign(up_world[2]) / np.linalg.norm(up_world)
+        print_relocalization(name, frames, state, arguments.relocalize, up_world)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Registers the frames of a stream one after another, and writes the trajectory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
+from hiosdf_jax._src.mapping.tracking import REACH_M, predict_pose, track
+from hiosdf_jax._src.output_files import replacing
+from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.view.paths import save_paths
+
+TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")
+
+
+class Tracked(NamedTuple):
+    """A frame and its pose.
+
+    Attributes:
+        frame: Its index in the stream.
+        given: (4, 4) T_world_sensor, as the stream has it.
+        pose: (4, 4) T_world_sensor, as the map has it; predicted, if the frame is not registered.
+        covariance: (6, 6) of the pose's error, m and rad, see `Registration`.
+        registered: Whether the frame fits the map there.
+    """
+
+    frame: int
+    given: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+    registered: bool
+
+
+class Tracker:
+    """Predicts and registers the poses of a stream.
+
+    The first frame has the pose that the stream gives it. Later ones are predicted from the last
+    registered frame by the motion between the stream's poses, or, for odometry, from the last two
+    frames by keeping the velocity.
+
+    Attributes:
+        frames: The frames so far, a `Tracked` each.
+    """
+
+    def __init__(self, odometry: bool) -> None:
+        """Begins before the first frame.
+
+        Args:
+            odometry: Use no pose of the stream but the first.
+        """
+        self.frames: list[Tracked] = []
+        self._odometry = odometry
+        self._reference: Tracked | None = None  # the last registered frame
+
+    def predict(self, given: np.ndarray) -> np.ndarray:
+        """Predicts the pose of the next frame from the pose (4, 4) that the stream gives it."""
+        if self._reference is None:
+            return given
+        if not self._odometry:
+            reference = self._reference
+            return np.asarray(predict_pose(reference.pose, reference.given, given))
+        before, last = self.frames[-2:] if len(self.frames) > 1 else 2 * self.frames
+        return np.asarray(predict_pose(last.pose, before.pose, last.pose))
+
+    def fuse(
+        self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
+    ) -> tuple[MapState, np.ndarray]:
+        """Registers a frame and fuses it if it fits; returns the map and the pose (4, 4)."""
+        predicted = self.predict(given)
+        state, found = track(state, cloud, predicted)
+        return state, self._add(frame, given, predicted, found)
+
+    def locate(
+        self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
+    ) -> np.ndarray:
+        """Registers a frame that the map is not given; returns the pose (4, 4)."""
+        predicted = self.predict(given)
+        return self._add(
+            frame, given, predicted, refine_pose(state, cloud, predicted, reach_m=REACH_M)
+        )
+
+    def counts(self) -> dict[str, int]:
+        """How many frames fit the map, and how many did not, by the keys of `metrics.json`."""
+        registered = sum(each.registered for each in self.frames)
+        return {
+            "frames_registered": registered,
+            "frames_not_registered": len(self.frames) - registered,
+        }
+
+    def write(self, folder: Path, up_world: np.ndarray) -> None:
+        """Writes `trajectory.txt`, `trajectory.npz` and `trajectory.png`.
+
+        Args:
+            folder: Where to write.
+            up_world: (3,) unit vector against gravity; the picture looks down along it.
+        """
+        from scipy.spatial.transform import Rotation
+
+        given, poses, covariances = (
+            np.stack([np.asarray(getattr(each, name)) for each in self.frames])
+            for name in ("given", "pose", "covariance")
+        )
+        frame = np.array([each.frame for each in self.frames])
+        registered = np.array([each.registered for each in self.frames])
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        rows = np.column_stack([frame, poses[:, :3, 3], quaternions])
+        with replacing(folder / TRAJECTORY[0]) as file:
+            np.savetxt(file, rows, "%.9g", header="frame tx ty tz qx qy qz qw")
+        with replacing(folder / TRAJECTORY[1]) as file:
+            np.savez(file, frame=frame, poses=poses, covariance=covariances, registered=registered)
+        save_paths(
+            folder / TRAJECTORY[2],
+            given[:, :3, 3],
+            poses[:, :3, 3],
+            registered,
+            100 * np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)),
+            up_world,
+        )
+
+    def _add(
+        self, frame: int, given: np.ndarray, predicted: np.ndarray, found: Registration
+    ) -> np.ndarray:
+        registered = bool(found.converged)
+        pose: Any = found.pose if registered else predicted
+        tracked = Tracked(frame, given, np.asarray(pose), np.asarray(found.covariance), registered)
+        self.frames.append(tracked)
+        if registered:
+            self._reference = tracked
+        return tracked.pose

@@ -1,0 +1,298 @@
+"""Finds the pose of a cloud in a map without any guess: from many hypotheses to a few, to the best.
+
+Hypotheses lie in free space, upright, and turned by any angle about the vertical. All are scored
+with few returns, the best of them are brought near a solution by coarse steps, and the best two
+places are refined.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.field.points import AnyField, as_field
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.mapping.registration.equations import (
+    Anchor,
+    Rows,
+    compare,
+    make_rows,
+)
+from hiosdf_jax._src.mapping.registration.matching import noise_of
+from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
+from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
+from hiosdf_jax._src.mapping.registration.selection import draw_evenly
+from hiosdf_jax._src.mapping.registration.solving import solve_coarse, take_evenly
+from hiosdf_jax._src.numerics.intake import as_array, as_key, check_whole, is_traced
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.posed_cloud import as_traced, checked_cloud, finite_rows
+from hiosdf_jax._src.state import Baked, Field
+
+# A sensor is at least this far from surfaces, m.
+_CLEARANCE_M = 0.15
+
+# Hypotheses are scored with this many returns. One that lies this far from a surface counts half.
+_FEW_ROWS = 64
+_LOOSE_M = 0.3
+_AT_ONCE = 4096
+
+# The best hypotheses, and the returns by which they are brought near a solution.
+_KEPT = 256
+_KEPT_ROWS = 256
+_KEPT_AT_ONCE = 32
+_REACH_M = 0.7
+_PLACES = 4
+
+# Final scores: a return within this distance lies on a surface, m.
+_SCORED_ROWS = 2048
+_FITS_M = 0.05
+
+# Poses within this many meters and radians of each other are one place.
+_PLACE_M, _PLACE_RAD = 0.5, 0.3
+
+
+class Relocalization(NamedTuple):
+    """Where a cloud fits a map, and where else.
+
+    Attributes:
+        best: The pose at which the cloud fits best.
+        score: Share of the cloud's returns that lie within 5 cm of a surface there, () float32.
+        other: The best pose at another place, at least 0.5 m or 17 degrees away.
+        other_score: The same share there. If it is close to `score`, the place is ambiguous.
+    """
+
+    best: Registration
+    score: jax.Array
+    other: Registration
+    other_score: jax.Array
+
+
+def relocalize(
+    field: AnyField,
+    cloud: Any,
+    key: jax.Array,
+    hypotheses: int = 65_536,
+    *,
+    up_sensor: Any = (0.0, 0.0, 1.0),
+    up_world: Any = (0.0, 0.0, 1.0),
+) -> Relocalization:
+    """Finds the pose of a cloud in a map without a prior.
+
+    Robots know gravity, from an accelerometer or their mounting: hypotheses are upright, at random
+    points of observed free space, and turned by any angle about the vertical. A tilt that is 3
+    degrees off does no harm. Pure: works inside `jit` and `vmap`.
+
+    Args:
+        field: A map, a snapshot of one, or a baked field.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        key: Source of the hypotheses, from `jax.random.key`.
+        hypotheses: How many are tried, at least 256. A house of 19 x 11 m needs the default.
+        up_sensor: The direction against gravity in the sensor's frame, (3,). A level camera whose y
+            points down has (0, -1, 0).
+        up_world: The direction against gravity in the map's frame, (3,).
+
+    Returns:
+        The best pose, and the best one at another place. Trust the best one if it has converged,
+        its score is high, and the other one's is clearly lower.
+
+    Raises:
+        ValueError: A type or shape is wrong, or `hypotheses` is too small. Outside jit also: the
+            cloud has no finite row, or a direction is zero or not finite.
+
+    Example:
+        >>> place = hio.relocalize(hio.load("map.npz"), cloud, jax.random.key(0))
+        >>> sure = place.best.converged & (place.score > place.other_score + 0.2)
+    """
+    field = as_field(field)
+    check_whole("hypotheses", hypotheses, _KEPT)
+    key = as_key("key", key)
+    ups = [_direction("up_sensor", up_sensor), _direction("up_world", up_world)]
+    traced = is_traced(*jax.tree.leaves((field, key)), cloud, *ups)
+    if traced:
+        cloud, _ = as_traced(cloud, jnp.eye(4))
+    else:
+        cloud = checked_cloud(cloud)
+        finite_rows(cloud)
+    points, some = _draw(cloud)
+    poses = _find_places(field, points, some, key, *ups, hypotheses)
+    if traced:
+        refined = jax.lax.map(lambda pose: refine_pose(field, cloud, pose), poses)
+    else:  # one compilation, that of every other call
+        each = [refine_pose(field, cloud, pose) for pose in poses]
+        refined = jax.tree.map(lambda *parts: jnp.stack(parts), *each)
+    return _choose(field, points, some, refined)
+
+
+def _direction(name: str, vector: Any) -> Any:
+    array = as_array(name, vector)
+    if np.shape(array) != (3,):
+        raise ValueError(f"{name} has shape {np.shape(array)}, expected (3,)")
+    if not is_traced(array):
+        length = np.linalg.norm(np.asarray(array, float))
+        if not (np.isfinite(length) and length > 0):
+            raise ValueError(f"{name} is {vector!r}, expected a direction: finite and not zero")
+    return array
+
+
+@jax.jit
+@plain
+def _draw(cloud: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Draws as many returns as scores need; fewer are padded, so that all clouds have one shape."""
+    points, some = draw_evenly(cloud, _SCORED_ROWS)
+    missing = _SCORED_ROWS - some.shape[0]
+    return jnp.pad(points, ((0, missing), (0, 0))), jnp.pad(some, (0, missing))
+
+
+@jax.jit(static_argnums=6)
+@plain
+def _find_places(
+    field: Field | Baked,
+    points: jax.Array,
+    some: jax.Array,
+    key: jax.Array,
+    up_sensor: jax.Array,
+    up_world: jax.Array,
+    hypotheses: int,
+) -> jax.Array:
+    """Finds poses at different places, the best first, (PLACES, 4, 4)."""
+    cells = _cells_of(field)
+    place_key, turn_key = jax.random.split(key)
+    positions = _draw_free(cells, place_key, hypotheses)
+    angles = jax.random.uniform(turn_key, (hypotheses,), jnp.float32, maxval=2 * jnp.pi)
+    up = up_world / jnp.linalg.norm(up_world)
+    level = _turn_onto(up_sensor / jnp.linalg.norm(up_sensor), up)
+
+    def pose_of(position: jax.Array, angle: jax.Array) -> jax.Array:
+        turn = jnp.matmul(rotation_of(angle * up), level, precision="highest")
+        return jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(position)
+
+    few, few_some = draw_evenly(jnp.where(some[:, None], points, jnp.nan), _FEW_ROWS)
+    costs = _costs(cells)
+
+    def cost(hypothesis: tuple[jax.Array, jax.Array]) -> jax.Array:
+        found = _look_up(cells, costs, 1.0, _place(pose_of(*hypothesis), few))
+        return jnp.sum(jnp.where(few_some, found, 0))
+
+    total = jax.lax.map(cost, (positions, angles), batch_size=_AT_ONCE)
+    _, kept = jax.lax.top_k(-total, _KEPT)
+    starts = jax.vmap(pose_of)(positions[kept], angles[kept])
+
+    rows = _rows(field, points, some)
+    fewer = take_evenly(rows, _KEPT_ROWS)
+
+    def improve(start: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = solve_coarse(field, fewer, start, Anchor(start, None), _REACH_M)
+        pose = jnp.where(jnp.all(jnp.isfinite(pose)), pose, start)
+        return pose, _score(field, rows, pose)
+
+    poses, scores = jax.lax.map(improve, starts, batch_size=_KEPT_AT_ONCE)
+    chosen = []
+    for _ in range(_PLACES):
+        best = jnp.argmax(scores)
+        chosen.append(poses[best])
+        scores = jnp.where(_same_place(poses[best], poses), -1, scores)
+    return jnp.stack(chosen)
+
+
+@jax.jit
+@plain
+def _choose(
+    field: Field | Baked, points: jax.Array, some: jax.Array, refined: Registration
+) -> Relocalization:
+    """Chooses the best two of refined poses that are not at one place."""
+    rows = _rows(field, points, some)
+    scores = jax.lax.map(lambda pose: _score(field, rows, pose), refined.pose)
+    best = jnp.argmax(scores)
+    elsewhere = jnp.where(_same_place(refined.pose[best], refined.pose), 0, scores)
+    other = jnp.argmax(elsewhere)
+
+    def take(index: jax.Array) -> Registration:
+        return jax.tree.map(lambda part: part[index], refined)
+
+    return Relocalization(take(best), scores[best], take(other), elsewhere[other])
+
+
+class _Cells(NamedTuple):
+    """The map in cells: voxels, or the surroundings of samples."""
+
+    corner_world: jax.Array  # of the first cell, m
+    size: jax.Array | float  # m
+    distance: jax.Array  # (X, Y, Z) m, of the centers
+    seen: jax.Array  # (X, Y, Z) bool
+
+
+def _cells_of(field: Field | Baked) -> _Cells:
+    if isinstance(field, Baked):
+        corner_world = field.corner_world - field.resolution / 2
+        return _Cells(corner_world, field.resolution, field.sdf, field.frontier > 0)
+    config, derived = field.config, field.surface.derived
+    corner_world = jnp.asarray(config.corner_index, jnp.float32) * config.voxel_size
+    distance = derived.sdf.astype(jnp.float32)
+    return _Cells(corner_world, config.voxel_size, distance, derived.frontier_steps > 0)
+
+
+def _costs(cells: _Cells) -> jax.Array:
+    """What a return costs that lies in a cell, from 0 to 1, (X, Y, Z)."""
+    square = cells.distance**2
+    return jnp.where(cells.seen, square / (square + _LOOSE_M**2), 1)
+
+
+def _look_up(
+    cells: _Cells, values: jax.Array, outside: float, points_world: jax.Array
+) -> jax.Array:
+    """Reads the values (X, Y, Z) of the cells in which points (N, 3) lie."""
+    shape = jnp.asarray(values.shape, jnp.float32)
+    cell = jnp.floor((points_world - cells.corner_world) / cells.size)
+    inside = jnp.all((cell >= 0) & (cell < shape), axis=-1)
+    x, y, z = jnp.where(inside[:, None], cell, 0).astype(jnp.int32).T
+    return jnp.where(inside, values.ravel()[geometry.flat_index(values.shape, (x, y, z))], outside)
+
+
+def _draw_free(cells: _Cells, key: jax.Array, count: int) -> jax.Array:
+    """Draws points of free space that was observed, (count, 3) m; of the box, if there is none."""
+    free = (cells.seen & (cells.distance > _CLEARANCE_M)).ravel()
+    free = jnp.where(jnp.any(free), free, True)
+    rank = jnp.cumsum(free, dtype=jnp.int32)
+    cell_key, offset_key = jax.random.split(key)
+    wanted = jax.random.randint(cell_key, (count,), 0, rank[-1], jnp.int32)
+    index = geometry.unflatten(cells.seen.shape, jnp.searchsorted(rank, wanted + 1))
+    offset = jax.random.uniform(offset_key, (count, 3), jnp.float32)
+    return cells.corner_world + (jnp.stack(index, axis=-1) + offset) * cells.size
+
+
+def _turn_onto(start: jax.Array, end: jax.Array) -> jax.Array:
+    """The smallest rotation from one unit vector to another, (3, 3)."""
+    cosine = jnp.sum(start * end)
+    axis = jnp.cross(start, end)
+    # Opposite vectors: half a turn about any axis across them.
+    across = jnp.cross(start, jnp.eye(3)[jnp.argmin(jnp.abs(start))])
+    opposite = cosine < -0.9999
+    axis = jnp.where(opposite, across, axis)
+    sine = jnp.linalg.norm(axis)
+    angle = jnp.where(opposite, jnp.pi, jnp.arctan2(sine, cosine))
+    return rotation_of(angle * axis / jnp.maximum(sine, 1e-9))
+
+
+def _place(pose: jax.Array, points: jax.Array) -> jax.Array:
+    return jnp.sum(points[:, None, :] * pose[:3, :3], axis=-1) + pose[:3, 3]
+
+
+def _rows(field: Field | Baked, points: jax.Array, some: jax.Array) -> Rows:
+    floor, growth = noise_of(field)
+    return make_rows(points, some, (jnp.float32(floor), jnp.float32(growth)))
+
+
+def _score(field: Field | Baked, rows: Rows, pose: jax.Array) -> jax.Array:
+    """The share of returns that lie on a surface."""
+    seen = compare(field, rows, pose, 0.0)
+    fits = seen.comparable & (jnp.abs(seen.distance) < _FITS_M)
+    return jnp.sum(fits) / jnp.maximum(jnp.sum(rows.some), 1)
+
+
+def _same_place(pose: jax.Array, poses: jax.Array) -> jax.Array:
+    """Whether poses (N, 4, 4) are near one, (N,) bool; one that is not finite is nowhere."""
+    way, turn = way_and_angle(pose, poses)
+    return ~((way > _PLACE_M) | (turn > _PLACE_RAD))

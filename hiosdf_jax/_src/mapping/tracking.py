@@ -1,0 +1,181 @@
+"""Maps a stream whose poses are only predicted: each is refined by the map before the update."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
+from hiosdf_jax._src.mapping.pipeline import run_update, trace_update
+from hiosdf_jax._src.mapping.registration.motion import way_and_angle
+from hiosdf_jax._src.mapping.registration.refining import (
+    Registration,
+    checked_reach,
+    refine_pose,
+)
+from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.intake import as_array, is_traced
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.posed_cloud import as_traced, check_extras, check_pose, prepare
+from hiosdf_jax._src.state import Flag, MapState, check_map
+
+REACH_M = 0.2
+"""How far surfaces may be from where they should be, by default."""
+
+# Without a prior the prediction is one, whose standard deviation is this share of `reach_m`, m and
+# rad. A cloud is not registered if its pose was moved by more than the other share.
+_PREDICTED_DEVIATION = 0.25
+_MOST_MOVED = 2.0
+
+_UNKNOWN_M = 100.0  # standard deviation of a pose of which nothing is known, m and rad
+
+
+def track(
+    state: MapState,
+    cloud: Any,
+    predicted_pose: Any,
+    prior: tuple[Any, Any] | None = None,
+    *,
+    donate: bool = False,
+    noise: tuple[Any, Any] | None = None,
+    reach_m: Any = REACH_M,
+) -> tuple[MapState, Registration]:
+    """Refines the predicted pose of a cloud by the map so far, and fuses the cloud there.
+
+    It is `refine_pose` and then `update`. A cloud that fits at no pose near the predicted one is
+    not fused: the map stays as it was, and `Flag.NOT_REGISTERED` is raised. The first cloud of a
+    map is fused where it is predicted, and so are those of the first five updates that do not fit.
+    Pure: works inside `jit`, `vmap` and `lax.scan`.
+
+    Args:
+        state: The map so far.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        predicted_pose: (4, 4) T_world_sensor, a few centimeters and degrees off; for instance from
+            `predict_pose`.
+        prior: As for `refine_pose`. By default the predicted pose, with a standard deviation of a
+            quarter of `reach_m`: 5 cm and 2.9 degrees.
+        donate: As for `update`.
+        noise: As for `update`.
+        reach_m: As for `refine_pose`. A pose that is farther than twice this from the prediction,
+            m or rad, is refused.
+
+    Returns:
+        The new map, and the registration. `converged` tells whether the cloud was to be fused.
+        Where it fits nowhere, the pose is the predicted one, and the covariance that of the prior,
+        or 100 m. The covariance of the first cloud is that of the prior, or 0: its pose defines
+        where the map is.
+
+    Raises:
+        ValueError: As `refine_pose` and `update` do.
+
+    Example:
+        >>> state, before = hio.track(state, *first)
+        >>> pose = before.pose
+        >>> for cloud in clouds:
+        ...     predicted = hio.predict_pose(pose, before.pose, pose)
+        ...     before, (state, found) = pose, hio.track(state, cloud, predicted)
+    """
+    check_map(state)
+    _, checked_noise = check_extras(None, noise)
+    reach = checked_reach(reach_m)
+    traced = is_traced(*jax.tree.leaves((state, prior, checked_noise, reach)))
+    if traced or is_traced(cloud, predicted_pose):
+        cloud, pose = as_traced(cloud, predicted_pose)
+        found = refine_pose(state, cloud, pose, prior, noise=noise)
+        found, raised = _register(state.updates, pose, found, _covariance_of(prior), reach)
+        return trace_update(state, cloud, found.pose, None, checked_noise, raised), found
+    padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
+    chosen = _prediction(pose, reach) if prior is None else prior
+    found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
+    own = _covariance_of(prior)
+    found, raised = _register_jit(state.updates, jax.device_put(pose), found, own, reach)
+    return run_update(state, padded, found.pose, (None, checked_noise), raised, donate), found
+
+
+def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
+    """Applies the motion between two poses to another one.
+
+    With odometry these are its poses at two frames, and the refined pose of the first. With none, a
+    sensor keeps its velocity: `predict_pose(pose, pose_before, pose)`.
+
+    Args:
+        pose: (4, 4) T_world_sensor, of the earlier frame.
+        before: (4, 4) T_odom_sensor of the same frame.
+        after: (4, 4) T_odom_sensor of the later frame.
+
+    Returns:
+        (4, 4) float32 T_world_sensor of the later frame. It is a rotation to float32's last digit,
+        so that long chains of predictions stay rigid.
+
+    Raises:
+        ValueError: A shape is wrong. Outside jit also: a pose is not finite or not rigid.
+
+    Example:
+        >>> predicted = hio.predict_pose(found.pose, odometry[i - 1], odometry[i])
+    """
+    poses = {"pose": pose, "before": before, "after": after}
+    if not is_traced(pose, before, after):
+        checked = (jax.device_put(check_pose(each, name)) for name, each in poses.items())
+        return _predict_pose_jit(*checked)
+    for name, each in poses.items():
+        if np.shape(each) != (4, 4):
+            raise ValueError(f"{name} has shape {np.shape(each)}, expected (4, 4)")
+    return _predict_pose(*(jnp.asarray(as_array(name, each)) for name, each in poses.items()))
+
+
+@plain
+def _predict_pose(pose: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:
+    turn, back = pose[:3, :3], before[:3, :3].T
+
+    def times(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.matmul(a, b, precision="highest")
+
+    way = times(back, after[:3, 3] - before[:3, 3])
+    rotation = times(turn, times(back, after[:3, :3]))
+    # One step toward the nearest rotation: a transpose is no inverse of a matrix that has drifted,
+    # and extrapolation would more than double the drift each time.
+    rotation = times(rotation, 1.5 * jnp.eye(3) - 0.5 * times(rotation.T, rotation))
+    result = jnp.eye(4).at[:3, :3].set(rotation)
+    return result.at[:3, 3].set(pose[:3, 3] + times(turn, way))
+
+
+_predict_pose_jit = jax.jit(_predict_pose)
+
+
+def _prediction(pose: Any, reach_m: jax.Array) -> tuple[Any, Any]:
+    """The prior that a prediction is where none is given."""
+    return pose, (_PREDICTED_DEVIATION * reach_m) ** 2 * jnp.eye(6, dtype=jnp.float32)
+
+
+def _covariance_of(prior: tuple[Any, Any] | None) -> jax.Array | None:
+    return None if prior is None else on_device("prior covariance", prior[1])
+
+
+@plain
+def _register(
+    updates: jax.Array,
+    predicted: jax.Array,
+    found: Registration,
+    own: jax.Array | None,
+    reach_m: jax.Array,
+) -> tuple[Registration, jax.Array]:
+    """Decides whether a cloud is fused, and where; also returns the flags that this raises."""
+    first = updates == 0
+    near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= _MOST_MOVED * reach_m
+    registered = found.converged & near & ~first
+    # A young map may have too few surfaces to register a cloud, and would never get more.
+    fused = registered | (updates < CONFIDENT_UPDATES)
+    if own is None:
+        own = jnp.where(first, 0, _UNKNOWN_M**2) * jnp.eye(6)
+    chosen = found._replace(
+        pose=jnp.where(registered, found.pose, predicted),
+        covariance=jnp.where(registered, found.covariance, own),
+        converged=fused,
+    )
+    return chosen, jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
+
+
+_register_jit = jax.jit(_register)

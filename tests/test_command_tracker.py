@@ -1,0 +1,115 @@
+"""Runs of the command that refine the poses of a stream, or use none of them."""
+
+import json
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from room import room_cloud
+from room_files import BOX, use_room_config
+from scipy.spatial.transform import Rotation
+
+from hiosdf_jax._src.command import cli, map_stream
+from hiosdf_jax._src.command.tracker import TRAJECTORY
+from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
+
+FRAMES = 15
+STILL = 7  # frames before the sensor moves: the small clouds of one make no map
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """The small map of the other tests, and no pictures of it."""
+    use_room_config(monkeypatch)
+    monkeypatch.setattr(map_stream.drawing, "draw_map", lambda *_: np.array([0.0, 0, 1]))
+
+
+def walk():
+    """Clouds (F, N, 3) along a slow walk, and the exact poses (F, 4, 4)."""
+    steps = np.maximum(np.arange(FRAMES) - STILL, 0)
+    frames = [
+        room_cloud(i, 300, 0.02 * k, (0.015 * k - 0.1, 0.01 * k, 0.0)) for i, k in enumerate(steps)
+    ]
+    return (np.stack(part) for part in zip(*frames, strict=True))
+
+
+def write(path, clouds, poses):
+    np.savez(
+        path,
+        poses=poses,
+        points_mm=np.rint(1000 * clouds.reshape(-1, 3)).astype(np.int16),
+        offsets=clouds.shape[1] * np.arange(len(clouds) + 1),
+    )
+    return str(path)
+
+
+def drifting(poses):
+    """Poses whose error grows by 1 cm and half a degree a frame, to 7 cm and 3.5 degrees."""
+    result = poses.astype(float)
+    for i, pose in enumerate(result):
+        k = max(i - STILL, 0)
+        pose[:3, :3] = Rotation.from_rotvec([0, 0, np.radians(0.5 * k)]).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] += [0.01 * k, 0, 0]
+    return result
+
+
+def way_cm(poses, exact):
+    return 100 * np.linalg.norm(poses[:, :3, 3] - exact[:, :3, 3], axis=-1)
+
+
+@pytest.mark.parametrize("option", ["--refine-poses", "--odometry"])
+def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, option):
+    clouds, exact = walk()
+    given = drifting(exact)
+    stream = write(tmp_path / "walk.npz", clouds, given)
+    output, saved = tmp_path / "out", tmp_path / "map.npz"
+    arguments = ["map", stream, option, "--output", str(output), "--save", str(saved), *BOX]
+    assert cli.main(arguments) == 0
+    assert {path.name for path in output.iterdir()} == {*TRAJECTORY, "metrics.json"}
+    with np.load(output / "trajectory.npz") as file:
+        poses, covariance, registered = file["poses"], file["covariance"], file["registered"]
+        np.testing.assert_array_equal(file["frame"], np.arange(FRAMES))
+    assert registered.all()
+    assert way_cm(given, exact).max() > 6.9
+    assert way_cm(poses, exact).max() < 3
+    assert covariance.shape == (FRAMES, 6, 6)
+    text = read_timed_poses(output / "trajectory.txt")
+    for i in range(FRAMES):
+        np.testing.assert_allclose(pose_at(text, i, 0.1), poses[i], atol=1e-5)
+    assert imread(output / "trajectory.png").std() > 0.05
+    metrics = json.loads((output / "metrics.json").read_text("utf-8"))
+    counts = metrics["frames_registered"], metrics["frames_not_registered"]
+    assert counts == (FRAMES, 0)
+    assert f"{FRAMES} poses were refined, 0 were not" in capsys.readouterr().out
+    # The map has no poses to go on with.
+    plain = ["map", stream, "--output", str(output), "--resume", str(saved), *BOX]
+    assert cli.main(plain) == 2
+    assert "does not say how far the map has come" in capsys.readouterr().err
+
+
+def test_a_frame_of_another_place_is_left_out(tmp_path, quick):
+    clouds, exact = walk()
+    clouds[12] = np.random.default_rng(0).normal(size=clouds[14].shape)
+    stream = write(tmp_path / "walk.npz", clouds, exact)
+    output = tmp_path / "out"
+    assert cli.main(["map", stream, "--refine-poses", "--output", str(output), *BOX]) == 0
+    with np.load(output / "trajectory.npz") as file:
+        assert list(np.flatnonzero(~file["registered"])) == [12]
+        assert way_cm(file["poses"], exact).max() < 3
+    metrics = json.loads((output / "metrics.json").read_text("utf-8"))
+    assert metrics["updates"] == FRAMES - 1
+    assert metrics["flags"] == ["NOT_REGISTERED"]
+
+
+@pytest.mark.parametrize("option", ["--refine-poses", "--odometry"])
+def test_such_a_run_cannot_be_resumed(tmp_path, capsys, option):
+    assert cli.main(["map", str(tmp_path / "a.npz"), option, "--resume", "map.npz"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"hiosdf: --resume cannot be combined with {option}: maps have no poses"
+
+
+def test_the_options_exclude_each_other(tmp_path, capsys):
+    with pytest.raises(SystemExit) as error:
+        cli.main(["map", str(tmp_path), "--refine-poses", "--odometry"])
+    assert error.value.code == 2
+    assert "not allowed with argument" in capsys.readouterr().err

@@ -1,0 +1,167 @@
+"""Frames whose poses are predicted: refined, fused, or flagged and left out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import CONFIG, arrays_equal, map_of_room, room_cloud
+from scipy.spatial.transform import Rotation
+
+import hiosdf_jax as hio
+
+COUNT = 300
+
+
+def moved(pose, translation, turn):
+    result = np.array(pose, float)
+    result[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ result[:3, :3]
+    result[:3, 3] += translation
+    return result.astype(np.float32)
+
+
+def frame():
+    """A cloud, its pose, and a prediction that is off."""
+    cloud, pose = room_cloud(70, COUNT, 0.3, (0.1, 0.05, 0.0))
+    return cloud, pose, moved(pose, [0.02, -0.015, 0.01], [0.01, 0.0, -0.02])
+
+
+def foreign():
+    """A cloud of another place."""
+    return np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)
+
+
+def test_a_frame_is_fused_at_its_refined_pose(sharp_map):
+    cloud, pose, predicted = frame()
+    state, found = hio.track(sharp_map, cloud, predicted)
+    assert bool(found.converged)
+    assert np.linalg.norm(np.asarray(found.pose)[:3, 3] - pose[:3, 3]) < 0.01
+    assert int(state.updates) == int(sharp_map.updates) + 1
+    assert int(state.report.update_flags) & hio.Flag.NOT_REGISTERED == 0
+    prior = predicted, 0.05**2 * np.eye(6)
+    refined = hio.refine_pose(sharp_map, cloud, predicted, prior, reach_m=0.2)
+    for part, expected in zip(found, refined, strict=True):
+        np.testing.assert_allclose(part, expected, atol=1e-5)
+    assert arrays_equal(state, hio.update(sharp_map, cloud, found.pose))
+
+
+def test_a_frame_of_another_place_changes_nothing_but_the_flags(sharp_map):
+    _, pose, _ = frame()
+    state, found = hio.track(sharp_map, foreign(), pose)
+    assert not bool(found.converged)
+    np.testing.assert_array_equal(found.pose, pose)
+    assert np.diag(found.covariance).min() >= 100**2
+    assert hio.Flag(int(state.report.update_flags)) == hio.Flag.NOT_REGISTERED
+    same = state.replace(report=sharp_map.report)
+    assert arrays_equal(same, sharp_map)
+
+
+def test_the_first_frame_is_fused_as_predicted(empty_map):
+    cloud, _, predicted = frame()
+    state, found = hio.track(empty_map, cloud, predicted)
+    assert bool(found.converged)
+    np.testing.assert_array_equal(found.pose, predicted)
+    np.testing.assert_array_equal(found.covariance, 0)
+    assert arrays_equal(state, hio.update(empty_map, cloud, predicted))
+    sure = (1e-4 * np.eye(6)).astype(np.float32)
+    _, found = hio.track(empty_map, cloud, predicted, (predicted, sure))
+    np.testing.assert_array_equal(found.covariance, sure)
+
+
+def test_a_young_map_takes_what_it_cannot_judge(empty_map):
+    state = empty_map
+    for k in range(6):
+        state, found = hio.track(state, foreign(), np.eye(4))
+        assert bool(found.converged) == (k < 5)
+    assert int(state.updates) == 5
+
+
+def test_scan_and_one_frame_after_another_agree(sharp_map):
+    frames = [room_cloud(i, COUNT, 0.05 * i, (0.02 * i, 0.01 * i, 0.0)) for i in range(3)]
+    clouds = np.stack([cloud for cloud, _ in frames])
+    clouds[1] = foreign()
+    poses = np.stack([moved(pose, [0.01, 0, 0], [0, 0, 0.01]) for _, pose in frames])
+    state, founds = sharp_map, []
+    for cloud, pose in zip(clouds, poses, strict=True):
+        state, found = hio.track(state, cloud, pose)
+        founds.append(found)
+    assert [bool(found.converged) for found in founds] == [True, False, True]
+
+    after, scanned = jax.lax.scan(
+        lambda state, frame: hio.track(state, *frame), sharp_map, (clouds, poses)
+    )
+    np.testing.assert_array_equal(scanned.converged, [found.converged for found in founds])
+    for k, found in enumerate(founds):
+        # Whole-voxel steps of the field make poses rest within a millimeter, not at one point.
+        np.testing.assert_allclose(scanned.pose[k], found.pose, atol=1e-3)
+    assert int(after.updates) == int(state.updates) == int(sharp_map.updates) + 2
+    assert int(after.report.flags) == int(state.report.flags)
+
+
+def test_a_stack_of_maps_is_traced_by_vmap(empty_map):
+    cloud, _, predicted = frame()
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), empty_map)
+    both = (np.stack([cloud, cloud]), np.stack([predicted, predicted]))
+    state, found = jax.eval_shape(jax.vmap(hio.track), stack, *both)
+    assert found.pose.shape == (2, 4, 4)
+    assert state.updates.shape == (2,)
+
+
+def test_a_glitch_of_the_predictions_leaves_the_map_as_without_it():
+    """Five frames in a row whose poses jump out of the room's reach."""
+    state = map_of_room(CONFIG, jax.random.key(0), 12, COUNT)
+    before = state
+    for i in range(5):
+        cloud, pose = room_cloud(90 + i, COUNT)
+        state, found = hio.track(state, cloud, moved(pose, [0.6, 0.5, 0.3], [0, 0, 0.8]))
+        assert not bool(found.converged)
+    assert arrays_equal(state.replace(report=before.report), before)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_prediction_is_the_motion_between_two_poses(seed):
+    rng = np.random.default_rng(seed)
+    poses = [moved(np.eye(4), rng.normal(size=3), rng.normal(size=3)) for _ in range(3)]
+    pose, before, after = (each.astype(float) for each in poses)
+    expected = pose @ np.linalg.inv(before) @ after
+    np.testing.assert_allclose(hio.predict_pose(*poses), expected, atol=2e-6)
+    np.testing.assert_allclose(jax.jit(hio.predict_pose)(*poses), expected, atol=2e-6)
+    np.testing.assert_allclose(hio.predict_pose(poses[0], poses[1], poses[1]), pose, atol=1e-6)
+
+
+def test_a_long_chain_of_predictions_stays_rigid():
+    """Extrapolation would more than double what a rotation is off, in each step."""
+    start = np.eye(4, dtype=np.float32)
+    second = moved(start, [0.1, 0.0, 0.02], [0.01, -0.02, 0.1])
+
+    def step(poses, _):
+        before, last = poses
+        return (last, hio.predict_pose(last, before, last)), None
+
+    (_, last), _ = jax.lax.scan(step, (start, second), None, 1000)
+    rotation = np.asarray(last, float)[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+    assert np.isfinite(np.asarray(last)).all()
+
+
+BAD = np.eye(4)
+BAD[0, 0] = 2
+
+
+def test_wrong_input_is_named(empty_map):
+    cloud, pose, _ = frame()
+    for arguments, message in [
+        ((3, cloud, pose), "state is int"),
+        ((empty_map, cloud[:, :2], pose), "cloud has shape"),
+        ((empty_map, cloud, BAD), "pose is not rigid"),
+        ((empty_map, cloud, pose, np.eye(4)), "prior is"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            hio.track(*arguments)
+    with pytest.raises(ValueError, match="reach_m is 0, expected > 0"):
+        hio.track(empty_map, cloud, pose, reach_m=0)
+    with pytest.raises(ValueError, match="before: pose is not rigid"):
+        hio.predict_pose(pose, BAD, pose)
+    with pytest.raises(ValueError, match="after: pose has shape"):
+        hio.predict_pose(pose, pose, np.eye(3))
+    with pytest.raises(ValueError, match=r"after has shape \(3, 3\), expected \(4, 4\)"):
+        jax.jit(hio.predict_pose)(pose, pose, np.eye(3))
