@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from room_files import BOX, use_room_config, write_points, write_range
@@ -226,11 +227,15 @@ def test_a_full_disk_keeps_the_older_run(tmp_path, capsys, quick, monkeypatch, e
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     # The test's stand-in for pictures is small; the map and the report are not.
+    # Nor must JAX's cache of compiled functions be written, which other tests read.
+    shortest = jax.config.jax_persistent_cache_min_compile_time_secs
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
     resource.setrlimit(resource.RLIMIT_FSIZE, (512, limit[1]))
     try:
         code = cli.main(arguments)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)
         signal.signal(signal.SIGXFSZ, old)
     assert code == 2
     lines = capsys.readouterr().err.splitlines()
