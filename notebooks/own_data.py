@@ -141,7 +141,7 @@ plt.show()
 
 # %% [markdown]
 # ## Keep it
-# `hio.save` keeps the whole map: `hio.load` and `hio.update` go on with it.
+# `hio.save` keeps the whole map: load it with `hio.load`, and update it further.
 # [Other programs](../docs/exports.md) read the mesh, the distances on a lattice, or a costmap.
 
 # %%

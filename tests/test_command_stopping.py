@@ -218,7 +218,7 @@ def test_a_map_of_another_run_is_kept_aside(tmp_path, monkeypatch, quick, record
     stopped_after(4, "--resume", str(output / "checkpoint.npz"))
     assert frames_of(output / "checkpoint.npz") == 4
     assert not (output / "checkpoint.2.npz").exists()
-    # A run that goes on with another file leaves this one; only its end replaces --save.
+    # A run that continues another file leaves this one; only its end replaces --save.
     resume = ["--resume", str(output / "checkpoint.1.npz"), "--save", str(saved)]
     saved.write_bytes((output / "checkpoint.npz").read_bytes())
     stopped_after(12, *resume)

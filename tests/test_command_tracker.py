@@ -81,7 +81,7 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, option):
     counts = metrics["frames_registered"], metrics["frames_not_registered"]
     assert counts == (FRAMES, 0)
     assert f"{FRAMES} poses were refined, 0 were not" in capsys.readouterr().out
-    # The map has no poses to go on with.
+    # The map has no poses, from which a run could continue.
     plain = ["map", stream, "--output", str(output), "--resume", str(saved), *BOX]
     assert cli.main(plain) == 2
     assert "does not say how far the map has come" in capsys.readouterr().err

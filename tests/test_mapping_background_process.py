@@ -239,7 +239,9 @@ def is_running(pid):
         return False
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="only Linux lists processes in /proc"
+)
 @pytest.mark.parametrize("runs", RUNS)
 @pytest.mark.parametrize("ending, code", ENDINGS.values(), ids=ENDINGS.keys())
 def test_a_script_that_does_not_close_its_mapper_ends(ending, code, runs, tmp_path):

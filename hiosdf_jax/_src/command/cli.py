@@ -74,7 +74,7 @@ examples:
       score the map against a mesh of the scene
   hiosdf map drive/ --save map.npz --checkpoint-every 100
   hiosdf map drive/ --save map.npz --resume map.npz
-      write the map after every 100 updates, and go on with it after a stop or a crash
+      write the map after every 100 updates, and continue it after a stop or a crash
   hiosdf map drive/ --refine-poses
       poses that drift: also writes trajectory.txt, trajectory.npz and trajectory.png
 
@@ -84,8 +84,7 @@ every tenth frame, which it is not given.
 
 A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it after the
 current frame with exit code 130, 143 and 129; a second one ends it at once. In each case the map so
-far is scored, drawn and written, to --save or to checkpoint.npz in the folder, and --resume goes on
-with it.
+far is scored, drawn and written, to --save or to checkpoint.npz in the folder. --resume continues it.
 """
 
 _VIEW_EXAMPLES = """\
@@ -699,7 +698,7 @@ def _parser() -> argparse.ArgumentParser:
         "--resume",
         type=Path,
         metavar="FILE",
-        help="go on with the map that a run of the same stream has written; its configuration, "
+        help="continue the map that a run of the same stream has written; its configuration, "
         "bounds and seed are used",
     )
     common.add_argument(
@@ -794,7 +793,7 @@ def _parser() -> argparse.ArgumentParser:
     poses.add_argument(
         "--odometry",
         action="store_true",
-        help="use no pose of the stream but the first: the map alone tells the others",
+        help="use only the first pose of the stream, and find the others by the map",
     )
 
     size = map_.add_argument_group("size of the map")

@@ -66,7 +66,7 @@ class LiveMap:
         """Starts to serve an empty view.
 
         Args:
-            stream: The frames; the first one tells where up is.
+            stream: The frames; up is computed from the first one.
             exact_sdf: Maps (n, 3) points, m, world frame, to (n,) exact distances, m, if known.
             host: Address to serve at.
             port: Port to serve at; the next free one is taken.
@@ -93,7 +93,7 @@ class LiveMap:
     def begin(
         self, write: Callable[[MapState, Progress], Path], stop: Callable[[], object]
     ) -> None:
-        """Is told how to write the map, and what ends a pause.
+        """Takes what writes the map, and what ends a pause.
 
         Args:
             write: Writes a map, and returns the file.

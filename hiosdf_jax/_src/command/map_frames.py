@@ -82,7 +82,7 @@ def fuse_frames(
 ) -> Mapped:
     """Fuses the frames of a stream into a map, one by one, with a progress bar.
 
-    A run that goes on with a map reads the frames before once more, to recognize the stream and to
+    A run that continues a map reads the frames before once more, to recognize the stream and to
     know the sensor's path, but does not fuse them again.
 
     Args:
@@ -92,7 +92,7 @@ def fuse_frames(
         held_out: Indices of frames that the map is not given; the result has returns of theirs.
         skip_bad_frames: Report bad frames on stderr and continue. By default the first bad frame
             ends the mapping.
-        resumed: The map to go on with.
+        resumed: The map to continue.
         keep: Is given the map so far, and how far it has come.
         keep_every: Number of updates after which `keep` is called again.
         stop: Is asked before each frame. The mapping ends if it returns something true, whose `str`

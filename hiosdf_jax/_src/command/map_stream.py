@@ -59,10 +59,9 @@ def run_stream(
     """Maps a stream, scores and draws the map, and writes everything into a folder.
 
     The folder gets `metrics.json`, `slices.png`, `mesh.ply` and `mesh.png`, and `growing.gif` if it
-    is to be drawn. They take the places of
-    older ones together, after the last of them is drawn; a run that fails leaves older ones as they
-    were. Without ground truth the map is scored on the returns of every tenth frame, which it is
-    not given.
+    is to be drawn. They replace older ones together, after the last of them is drawn; a run that
+    fails leaves older ones as they were. Without ground truth the map is scored on the returns of
+    every tenth frame, which it is not given.
 
     A bad frame or a signal ends the mapping. The map of the frames before it is valid, so it is
     still saved, scored, drawn and written before the error is raised.
@@ -79,7 +78,7 @@ def run_stream(
         save_path: Where to write the map itself, see `hiosdf_jax.load`. By default it is written
             to `checkpoint.npz` in the folder, and only while the run has not come to its end.
         skip_bad_frames: Skip bad frames and count them.
-        resumed: The map to go on with; of the same configuration and seed.
+        resumed: The map to continue; of the same configuration and seed.
         resume_path: Its file, which this run may replace and, at its end, remove. A map of another
             run is renamed before one that is not finished takes its place.
         checkpoint_every: Number of updates after which the map is written again.
@@ -172,7 +171,7 @@ def run_stream(
     with replacing_together(output, RESULTS) as folder:
         up_world = drawing.draw_map(folder, queries, exact_sdf, mapped.path_world, mapped.up_world)
         if surfaces:
-            before = len(mapped.path_world) - fused  # positions of a run that this one goes on with
+            before = len(mapped.path_world) - fused  # positions of the run that this one continues
             stages = [Stage(mesh, mapped.path_world[: before + k]) for k, mesh in surfaces]
             save_growing(folder / "growing.gif", stages, up_world)
         described = report.describe(mapped, config) | {"stream": name, "seed": seed} | scores

@@ -63,7 +63,7 @@ def track(
             m or rad, is refused.
 
     Returns:
-        The new map, and the registration. `converged` tells whether the cloud was to be fused.
+        The new map, and the registration. `converged` is False if the cloud was not to be fused.
         Where it fits nowhere, the pose is the predicted one, and the covariance that of the prior,
         or 100 m. The covariance of the first cloud is that of the prior, or 0: its pose defines
         where the map is.

@@ -1,4 +1,4 @@
-"""A live view of a map in a browser, served on this machine alone unless told otherwise."""
+"""A live view of a map in a browser, served on this machine alone by default."""
 
 from __future__ import annotations
 

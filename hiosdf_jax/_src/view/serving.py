@@ -1,4 +1,4 @@
-"""Starts and ends a server of viser, for this machine alone unless told otherwise."""
+"""Starts and ends a server of viser, for this machine alone by default."""
 
 from __future__ import annotations
 

@@ -217,7 +217,7 @@ def pack_serve(serve: Any) -> bytes:
 
     Raises:
         ValueError: It is something else. What is pickled is a copy: a closure or an object's method
-            would go on with the values of now.
+            would keep the values that it has now.
     """
     function = serve.func if isinstance(serve, functools.partial) else serve
     if function is not None and not _is_importable(function):

@@ -252,7 +252,7 @@ class BackgroundMapper:
         self._thread.join(_CLOSING_S)
 
     def _abandon(self) -> None:
-        """Tells the thread to end without fusing the waiting frame."""
+        """Makes the thread end without fusing the waiting frame."""
         with self._changed:
             self._waiting = None
             self._closed = True
