@@ -4,8 +4,8 @@
 
 Each period the controller queries 1,000 spheres with gradients. A deadline is missed where a period
 ends after the next one should have. The controller runs three times: without a mapper, beside a
-mapper in a thread, and beside a mapper in a process. Other work on the machine counts: the run without a
-mapper shows how much, and `load` is in the output.
+mapper in a thread, and beside a mapper in a process. Other work on the machine counts: the run
+without a mapper shows how much, and `load` is in the output.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import pytest
 import hiosdf_jax as hio
 from hiosdf_jax import demo
 from hiosdf_jax._src.command import cli
+from hiosdf_jax._src.command.arguments import parser_of
 from hiosdf_jax._src.mapping import stages
 
 ROOT = Path(__file__).parent.parent
@@ -124,7 +125,7 @@ def test_a_shell_block_has_commands_that_exist(block):
     for program, *arguments in commands(block):
         program = Path(program).name
         if program == "hiosdf":
-            cli._parser().parse_args(arguments)
+            parser_of(cli.COMMANDS).parse_args(arguments)
         elif program.startswith("python") and arguments[0] == "-m":
             assert importlib.util.find_spec(arguments[1]), arguments
         elif program.startswith("python"):

@@ -1,0 +1,368 @@
+"""The arguments of the `hiosdf` command and its help texts."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+DEMO_FRAMES = 80
+"""Frames of `hiosdf demo` if --frames is not given."""
+
+_EXAMPLES = """\
+examples:
+  hiosdf demo                           map a simulated apartment, score the map and draw it
+  hiosdf demo --plan                    let a robot explore the apartment
+  hiosdf map house_depth.npz            map a recorded stream, score the map and draw it
+  hiosdf map house_depth.npz --view     the same, in a browser while the map grows
+  hiosdf eval map.npz house_depth.npz   score a saved map against exact distances
+  hiosdf map --help                     streams, ground truth, and what else a run can do
+  hiosdf view map.npz                   show a saved map in a browser
+  hiosdf export map.npz --to map.vti    write it for ParaView, ROS, Blender, numpy
+  hiosdf info map.npz                   what a saved map is, in plain words
+"""
+_DEMO_EXAMPLES = """\
+examples:
+  hiosdf demo --frames 20               the same path with fewer frames
+  hiosdf demo --config paper --seed 1   with the numbers of the paper
+  hiosdf demo --plan --seed 3           a robot drives from one room to another
+
+The folder gets metrics.json, slices.png, mesh.ply, mesh.png and growing.gif, which shows the map
+grow; with --plan it gets metrics.json, plan.png and plan.gif. Ctrl-C ends the mapping as it does
+with hiosdf map; with --plan it ends the run at once, and nothing is written.
+"""
+_MAP_EXAMPLES = """\
+examples:
+  hiosdf map house_depth.npz --frames 20 --save map.npz
+      map the first 20 frames, and keep the map for hio.load("map.npz")
+  hiosdf map rgbd_dataset_freiburg1_desk
+      a TUM RGB-D sequence; the format is recognized from the folder
+  hiosdf map drive/ --cloud-topic /points --odometry-topic /odom
+      a ROS bag with several clouds and no tf
+  hiosdf map scans/ --trajectory poses.txt --bounds -5 -5 0 5 5 3 --max-range 8
+      a folder of .ply or .pcd clouds; given both, bounds and range need no first reading
+  hiosdf map stream.npz --ground-truth house.ply
+      score the map against a mesh of the scene
+  hiosdf map drive/ --save map.npz --checkpoint-every 100
+  hiosdf map drive/ --save map.npz --resume map.npz
+      write the map after every 100 updates, and continue it after a stop or a crash
+  hiosdf map drive/ --refine-poses
+      poses that drift: also writes trajectory.txt, trajectory.npz and trajectory.png
+
+The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
+exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
+every tenth frame, which it is not given.
+
+A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it after the
+current frame with exit code 130, 143 and 129; a second one ends it at once. In each case the map so
+far is scored, drawn and written, to --save or to checkpoint.npz in the folder. --resume continues
+it.
+"""
+
+_VIEW_EXAMPLES = """\
+examples:
+  hiosdf view map.npz                        until Ctrl-C, at http://127.0.0.1:8080
+  hiosdf view map.npz --export scene.html    one file that needs no server, and no view
+  hiosdf view map.npz --host 0.0.0.0         other machines can connect, without a password
+
+The map is what --save of hiosdf map, or hio.save, has written. The view needs the extra view: in a
+clone, pip install '.[view]'.
+"""
+
+_EXPORT_EXAMPLES = """\
+examples:
+  hiosdf export map.npz --to map.vti --resolution 0.1
+      the field for ParaView; .npz has the same for numpy
+  hiosdf export map.npz --to floor.yaml --floor 0 --height 1.2 --radius 0.3
+      a costmap for ROS navigation: floor.yaml and floor.pgm
+  hiosdf export map.npz --to map.glb
+      the mesh for Blender and browsers; .ply has it in the world frame
+  hiosdf export map.npz --to map.safetensors
+      the weights of the network
+  hiosdf export map.npz --to scene.html
+      the view in one file
+  hiosdf export hiosdf_output/demo/metrics.json --to metrics.csv
+      the metrics of a run, for a spreadsheet
+"""
+
+_EVAL_EXAMPLES = """\
+examples:
+  hiosdf eval map.npz house_depth.npz                        the exact distances of the stream
+  hiosdf eval map.npz scans/ --ground-truth house.ply        a mesh of the scene
+  hiosdf eval map.npz house_depth.npz --to metrics.json      and as JSON
+"""
+
+
+def parser_of(
+    commands: Mapping[str, Callable[[argparse.Namespace], None]],
+) -> argparse.ArgumentParser:
+    """Makes the parser of the command's arguments.
+
+    Args:
+        commands: The function of each subcommand, by its name. `options.command` is that of the
+            chosen one.
+
+    Returns:
+        The parser.
+    """
+    help_style = argparse.RawDescriptionHelpFormatter  # keeps the line breaks of the examples
+    parser = argparse.ArgumentParser(
+        prog="hiosdf",
+        description="Signed distance fields from posed point clouds, online.",
+        epilog=_EXAMPLES,
+        formatter_class=help_style,
+    )
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument(
+        "--config",
+        choices=("light", "paper", "default"),
+        help="size of the map: light suits a CPU, default a GPU, paper has the paper's numbers "
+        "(default: light on a CPU, default on a GPU)",
+    )
+    common.add_argument("--seed", type=_whole(0), help="seed of all randomness (default: 0)")
+    common.add_argument(
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help='write the map, for hio.load("FILE") and --resume FILE',
+    )
+    common.add_argument(
+        "--checkpoint-every",
+        type=_whole(1),
+        metavar="N",
+        help="write the map after every N updates, too: to --save, or to checkpoint.npz in the "
+        "folder of the output",
+    )
+    common.add_argument(
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="continue the map that a run of the same stream has written; its configuration, "
+        "bounds and seed are used",
+    )
+    common.add_argument(
+        "--view",
+        action="store_true",
+        help="show the map in a browser while it grows, and on until Ctrl-C; needs viser",
+    )
+    served = argparse.ArgumentParser(add_help=False)
+    served.add_argument(
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help="write the view as one HTML file that needs no server; needs viser",
+    )
+    served.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address of the view (default: 127.0.0.1, which only this machine can reach)",
+    )
+    served.add_argument(
+        "--port",
+        type=_whole(0),
+        default=8080,
+        help="port of the view; the next free one is taken (default: 8080)",
+    )
+
+    demo = subparsers.add_parser(
+        "demo",
+        parents=[common, served],
+        help="map a simulated apartment and score the map",
+        description="Map a simulated, furnished apartment, score the map against exact distances\n"
+        "and draw it. Or, with --plan, let a robot explore it.",
+        epilog=_DEMO_EXAMPLES,
+        formatter_class=help_style,
+    )
+    demo.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder for metrics and pictures (default: hiosdf_output/demo, or demo_plan)",
+    )
+    demo.add_argument(
+        "--frames",
+        type=_whole(1),
+        metavar="N",
+        help=f"number of frames along the camera's path (default: {DEMO_FRAMES})",
+    )
+    demo.add_argument(
+        "--plan",
+        action="store_true",
+        help="let a robot drive to another room, knowing only its own map; --seed also chooses "
+        "start and goal; needs the extra [plan]",
+    )
+    demo.set_defaults(command=commands["demo"])
+
+    map_ = subparsers.add_parser(
+        "map",
+        parents=[common, served],
+        help="map a recorded stream and score the map",
+        description="Map a recorded stream of posed clouds, score the map and draw it.",
+        epilog=_MAP_EXAMPLES,
+        formatter_class=help_style,
+    )
+    map_.add_argument("stream", type=Path, metavar="STREAM", help="file or folder; see --format")
+    map_.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder for metrics and pictures (default: hiosdf_output/STREAM)",
+    )
+    map_.add_argument("--frames", type=_whole(1), metavar="N", help="use only the first N frames")
+    map_.add_argument(
+        "--skip-bad-frames",
+        action="store_true",
+        help="skip and count frames that cannot be read, have no return or no usable pose",
+    )
+    map_.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="FILE",
+        help="score against the scene: a triangle mesh (.ply, .obj, .stl, .off or .glb) in the "
+        "stream's world frame and in meters, "
+        "or a folder with iSDF's sdf.npy and transform.txt",
+    )
+
+    poses = map_.add_mutually_exclusive_group()
+    poses.add_argument(
+        "--refine-poses",
+        action="store_true",
+        help="the stream's poses drift: refine each by the map so far, before the frame is fused",
+    )
+    poses.add_argument(
+        "--odometry",
+        action="store_true",
+        help="use only the first pose of the stream, and find the others by the map",
+    )
+
+    size = map_.add_argument_group("size of the map")
+    size.add_argument(
+        "--bounds",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="mapped box, m, world frame (default: found in a first reading of the stream)",
+    )
+    size.add_argument(
+        "--voxel-size", type=float, metavar="M", help="edge of a voxel, m (default: 0.1)"
+    )
+    size.add_argument(
+        "--max-range",
+        type=float,
+        metavar="M",
+        help="returns beyond this range, m, leave no surface (default: found in a first reading)",
+    )
+
+    formats = map_.add_argument_group("format of the stream")
+    formats.add_argument(
+        "--format",
+        metavar="NAME",
+        help="npz, replicacad, scannet, tum, kitti, clouds or rosbag (default: recognized from the "
+        "file or folder)",
+    )
+    formats.add_argument(
+        "--intrinsics",
+        type=float,
+        nargs=4,
+        metavar=("FX", "FY", "CX", "CY"),
+        help="tum: intrinsics in pixels (default: from freiburg1, 2 or 3 in the folder's name)",
+    )
+    formats.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="clouds: file of poses (default: the only .txt or .tum file in the folder)",
+    )
+    formats.add_argument(
+        "--cloud-topic", metavar="TOPIC", help="rosbag: topic of the clouds, if there are several"
+    )
+    formats.add_argument(
+        "--odometry-topic",
+        metavar="TOPIC",
+        help="rosbag: topic of the odometry, if tf does not contain the motion",
+    )
+    formats.add_argument(
+        "--world-frame",
+        metavar="FRAME",
+        help="rosbag: frame of the map (default: the root of the tf tree)",
+    )
+    map_.set_defaults(command=commands["map"])
+
+    view = subparsers.add_parser(
+        "view",
+        parents=[served],
+        help="show a saved map in a browser",
+        description="Show a saved map in a browser, in three dimensions.",
+        epilog=_VIEW_EXAMPLES,
+        formatter_class=help_style,
+    )
+    view.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    view.set_defaults(command=commands["view"])
+
+    export = subparsers.add_parser(
+        "export",
+        help="write a saved map as a file of another program",
+        description="Write a saved map as a file of another program, by the suffix of its name.",
+        epilog=_EXPORT_EXAMPLES,
+        formatter_class=help_style,
+    )
+    export.add_argument(
+        "map", type=Path, metavar="MAP", help="the file of a map; for .csv, that of the metrics"
+    )
+    export.add_argument("--to", type=Path, required=True, metavar="FILE", help="the file to write")
+    export.add_argument(
+        "--resolution",
+        type=float,
+        default=0.05,
+        metavar="M",
+        help="spacing of the samples, edge of a cell or of a triangle, m (default: 0.05)",
+    )
+    robot = export.add_argument_group("costmap")
+    for name, text in {
+        "floor": "height of the floor, m, world frame",
+        "height": "height of the robot, m",
+        "radius": "radius of the robot, m",
+        "step": "what is lower above the floor is no obstacle, m (default: 0.1)",
+    }.items():
+        robot.add_argument(f"--{name}", type=float, metavar="M", help=text)
+    export.set_defaults(command=commands["export"])
+
+    eval_ = subparsers.add_parser(
+        "eval",
+        help="score a saved map against exact distances",
+        description="Score a saved map against exact distances, where its stream has observed the\n"
+        "scene: those of an .npz stream (eval_*), or a mesh.",
+        epilog=_EVAL_EXAMPLES,
+        formatter_class=help_style,
+    )
+    eval_.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    eval_.add_argument("stream", type=Path, metavar="STREAM", help="the stream that it was made of")
+    eval_.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="FILE",
+        help="score against the scene: a triangle mesh in the stream's world frame and in meters, "
+        "or a folder with iSDF's sdf.npy and transform.txt",
+    )
+    eval_.add_argument("--to", type=Path, metavar="FILE", help="write the scores as JSON, too")
+    eval_.set_defaults(command=commands["eval"], format=None, frames=None)
+
+    info = subparsers.add_parser(
+        "info",
+        help="what a saved map is, in plain words",
+        description="Describe a saved map: its extent, updates, memory, problems, configuration.",
+    )
+    info.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
+    info.set_defaults(command=commands["info"])
+    return parser
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    def whole_number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{value}, expected at least {least}")
+        return value
+
+    return whole_number
