@@ -57,7 +57,7 @@ def rebin(source: Config, evidence: Evidence, target: Config, pose: jax.Array) -
         return jnp.where(mask, values, 0).reshape(*shape, *values.shape[1:])
 
     window = EvidenceWindow(
-        start=jnp.zeros(3, jnp.int32),
+        start=moved.start,
         hits=choose(moved.hits, 0),
         passes=choose(moved.passes, free.passes),
         behind=choose(moved.behind, free.behind),
@@ -78,28 +78,16 @@ class _FreeSpace(NamedTuple):
     change: jax.Array
 
 
-class _Patches(NamedTuple):
-    """The evidence of the new voxels with a patch."""
-
-    hits: jax.Array
-    passes: jax.Array
-    behind: jax.Array
-    weight: jax.Array
-    mean: jax.Array
-    axes: jax.Array
-    change: jax.Array
-
-
 def _move_patches(
     source: Config, evidence: Evidence, target: Config, pose: jax.Array
-) -> tuple[_Patches, jax.Array]:
+) -> tuple[EvidenceWindow, jax.Array]:
     """Moves the patches, and adds up those that meet in a voxel.
 
     Only the surest patches of a voxel count: stray hits must not carve a surface that they meet.
     Stray hits that meet do not become a surface either.
 
     Returns:
-        The evidence of each voxel with a patch, and how sure the patch is, (V,) int32.
+        The evidence of each voxel with a patch, raveled, and how sure the patch is, (V,) int32.
     """
     rotation, shift = pose[:3, :3], split(pose[:3, 3] / target.voxel_size)
     count, shape = evidence.hits.size, target.grid_shape
@@ -164,7 +152,8 @@ def _move_patches(
     hidden = most((passes < 0).astype(jnp.int32), 0) > 0
     sum_passes = total(jnp.abs(passes))
     most_hits = jnp.zeros(voxels, jnp.float32).at[voxel].max(hits, mode="drop")
-    new = _Patches(
+    new = EvidenceWindow(
+        start=jnp.zeros(3, jnp.int32),
         hits=jnp.where(surest == _SURFACE, total(hits), most_hits),
         passes=jnp.where(hidden, -sum_passes, sum_passes),
         behind=total(behind),
