@@ -1,11 +1,8 @@
 """Mapping in a thread: the same map, valid fields, and a planner that never waits."""
 
 import contextlib
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -321,38 +318,3 @@ def test_closing_and_waiting_end_while_a_frame_takes_forever(empty_map, monkeypa
             call(timeout_s=0.1)
     go.set()
     mapper.close()
-
-
-ENDINGS = {"end of the script": ("", 0), "exit": ("sys.exit(7)", 7), "exception": ("1 / 0", 1)}
-
-
-@pytest.mark.parametrize("ending, code", ENDINGS.values(), ids=ENDINGS.keys())
-def test_a_mapper_that_is_not_closed_does_not_crash_the_interpreter(ending, code):
-    """It works on a frame while the interpreter ends."""
-    script = f"""
-import sys, time
-import jax, jax.numpy as jnp
-import hiosdf_jax as hio
-from room import CONFIG
-from hiosdf_jax._src.mapping.background import fusing
-
-@jax.jit
-def work(x):
-    return jax.lax.fori_loop(0, 300, lambda _, x: jnp.tanh(x @ x), x)
-
-def update(state, cloud, pose, **_):
-    for _ in range(10):
-        jax.block_until_ready(work(jnp.ones((200, 200))))
-    return state
-
-fusing.update = update
-mapper = hio.BackgroundMapper(hio.init(CONFIG, jax.random.key(0)))
-for _ in range(3):
-    mapper.put(jnp.ones((5, 3)), jnp.eye(4))
-    time.sleep(0.2)
-{ending}
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, timeout=60
-    )
-    assert done.returncode == code, done.stderr.decode()[-2000:]

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hiosdf_jax._src.mapping.background.child import Child, pack_serve
+from hiosdf_jax._src.mapping.background.ending import end_with_interpreter
 from hiosdf_jax._src.mapping.background.fusing import (
     Frame,
     Fuser,
@@ -53,8 +54,8 @@ class BackgroundMapper:
     persistent cache has it (`JAX_COMPILATION_CACHE_DIR`), and `wait` and `close` bring the map
     back. If that process is killed, what it has mapped since the last `wait` is lost.
 
-    When the interpreter exits, a thread that is still at work finishes its frame, which takes
-    longer where the first update is being compiled. A process is killed, and also ends if its
+    When the interpreter exits, the frame that is being fused is given up: within seconds on Linux,
+    also while XLA compiles; elsewhere when XLA is done. A process is killed, and also ends if its
     parent is killed.
 
     Reading `field` never waits and never raises. A controller that reads nothing else should stop
@@ -249,7 +250,7 @@ class BackgroundMapper:
         """Ends the thread as soon as possible, for the interpreter ends."""
         self._abandon()
         self._fuser.stop()
-        self._thread.join(_CLOSING_S)
+        end_with_interpreter(self._thread)
 
     def _abandon(self) -> None:
         """Makes the thread end without fusing the waiting frame."""
