@@ -6,7 +6,7 @@ import ctypes
 import signal
 import threading
 
-_WAIT_S = 2.0
+_WAIT_S = 1.0
 _HANG_S = 5
 
 
@@ -14,7 +14,7 @@ def end_with_interpreter(thread: threading.Thread) -> None:
     """Ends a daemon thread that would crash the interpreter's exit. Call it from `atexit`.
 
     The thread gets a SystemExit, which ends Python code such as JAX's tracing at once. XLA cannot
-    be interrupted. Where it compiles for longer than two seconds, the process ends without waiting
+    be interrupted. Where it compiles for longer than a second, the process ends without waiting
     for the thread, with the exit code that the script has. That needs `on_exit` of glibc: elsewhere
     this waits.
 
