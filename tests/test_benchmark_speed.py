@@ -17,6 +17,7 @@ import hiosdf_jax as hio
 from benchmarks.speed import __main__ as command
 from benchmarks.speed import (
     baselines,
+    fleets,
     limits,
     plan,
     processes,
@@ -89,9 +90,9 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         taken_apart.append((state, frame, stages.take_apart(state, frame)))
         return taken_apart[-1][-1]
 
-    def chosen(setup):  # the others compile updates of their own, and have a test without
+    def chosen(setup):  # the others compile updates of their own, and have their own tests
         tasks = plan.plan(setup).items()
-        return {name: task for name, task in tasks if "sizes" not in name}
+        return {name: task for name, task in tasks if "sizes" not in name and name != "fleet"}
 
     def import_time(command, **_):
         return "1.5" if "hiosdf_jax" in command[-1] else "1.0"
@@ -150,6 +151,14 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         assert np.shape(before) == np.shape(ours)
     assert int(whole.updates) == int(state.updates) + 1
     assert np.abs(np.asarray(whole.grid.derived.sdf - state.grid.derived.sdf)).max() > 0.01
+
+
+@pytest.mark.long
+def test_a_fleet_is_timed():
+    update, query, size, error = fleets.maps_at_once(2, 0.01).rows
+    assert update.name == "update of 2 maps of 4 x 4 x 2 m" and update.spread.median > 0
+    assert query.spread.median > 0 and size.spread.median > 0.1
+    assert error.spread.median < 10
 
 
 def without_key(state):

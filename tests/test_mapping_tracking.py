@@ -97,6 +97,7 @@ def test_scan_and_one_frame_after_another_agree(sharp_map):
     assert int(after.report.flags) == int(state.report.flags)
 
 
+@pytest.mark.long
 def test_a_stack_of_maps_is_traced_by_vmap(empty_map):
     cloud, _, predicted = frame()
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), empty_map)
