@@ -7,7 +7,9 @@ controller itself through vmap.
 
 import dataclasses
 import functools
+import inspect
 import sys
+import textwrap
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
@@ -25,7 +27,8 @@ def install(monkeypatch, *names):
     """Makes the stand-ins importable for one test, and their adapters import them anew."""
     for name in names:
         adapter = f"hiosdf_jax._src.planning.adapters.{name}"
-        monkeypatch.delitem(sys.modules, adapter, raising=False)
+        monkeypatch.setitem(sys.modules, adapter, None)  # forgotten again after the test
+        del sys.modules[adapter]
         for path, content in PACKAGES[name].items():
             module = ModuleType(path)
             module.__spec__ = ModuleSpec(path, None, is_package=True)
@@ -35,6 +38,11 @@ def install(monkeypatch, *names):
             parent, _, child = path.rpartition(".")
             if parent:
                 setattr(sys.modules[parent], child, module)
+
+
+def example_of(function):
+    """The code of the example in a docstring."""
+    return textwrap.dedent(inspect.getdoc(function).split("Example:\n")[1].split("\nArgs:")[0])
 
 
 # --- jaxls ---
@@ -287,11 +295,3 @@ PACKAGES = {
     },
 }
 """Package -> its modules -> their contents."""
-
-
-def example_of(function):
-    """The code of the example in a docstring."""
-    import inspect
-    import textwrap
-
-    return textwrap.dedent(inspect.getdoc(function).split("Example:\n")[1].split("\nArgs:")[0])
