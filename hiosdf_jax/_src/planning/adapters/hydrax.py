@@ -27,7 +27,8 @@ def optimizer(
 
     The costs of the controller's task read the map as `self.field`. A task that is given its map
     beforehand keeps the one that it was compiled with. Here a copy of the task gets the map inside
-    jit, so that one compilation serves all maps of one configuration.
+    jit, so that one compilation serves all maps of one configuration. hydrax places the geoms
+    before `running_cost`; in `terminal_cost` they are where they were one simulation step earlier.
 
     Example:
         geoms, radii = planning.mjx.sphere_geoms(model)
