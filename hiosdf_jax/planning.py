@@ -7,6 +7,9 @@ The adapters are imported on first use and need their libraries:
     planning.cbf    cbfpy: a safety filter for velocity commands
     planning.frax   frax: whole-arm clearance of a manipulator
     planning.mjx    mujoco-mjx: rollouts of a simulated robot
+    planning.jaxls  jaxls: hard constraints and costs of clearance, for least squares
+    planning.pyroki pyroki: the collision spheres of its robots
+    planning.hydrax hydrax: sampling-based control with the map as an argument
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import importlib.util
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from hiosdf_jax._src.planning.body import clearance_and_jacobian
 from hiosdf_jax._src.planning.clearance import sphere_clearance, sphere_clearance_and_grad
 from hiosdf_jax._src.planning.cost import collision_cost
 from hiosdf_jax._src.planning.robot.spheres import (
@@ -32,13 +36,17 @@ from hiosdf_jax._src.planning.trajectory import Trajectory, optimize_trajectory,
 if TYPE_CHECKING:
     from hiosdf_jax._src.planning.adapters import cbf as cbf
     from hiosdf_jax._src.planning.adapters import frax as frax
+    from hiosdf_jax._src.planning.adapters import hydrax as hydrax
+    from hiosdf_jax._src.planning.adapters import jaxls as jaxls
     from hiosdf_jax._src.planning.adapters import mjx as mjx
     from hiosdf_jax._src.planning.adapters import mppi as mppi
+    from hiosdf_jax._src.planning.adapters import pyroki as pyroki
 
 __all__ = [
     "BodyPoses",
     "RobotSpheres",
     "Trajectory",
+    "clearance_and_jacobian",
     "collision_cost",
     "optimize_trajectory",
     "place_spheres",
@@ -52,8 +60,23 @@ __all__ = [
     "waves",
 ]
 
-_ADAPTERS = {"cbf": "cbfpy", "frax": "frax", "mjx": "mujoco", "mppi": "jax_mppi"}
+_ADAPTERS = {
+    "cbf": "cbfpy",
+    "frax": "frax",
+    "hydrax": "hydrax",
+    "jaxls": "jaxls",
+    "mjx": "mujoco",
+    "mppi": "jax_mppi",
+    "pyroki": "pyroki",
+}
 """Adapter -> the module that it needs."""
+
+_REPOSITORIES = {
+    "hydrax": "https://github.com/vincekurtz/hydrax.git",
+    "jaxls": "https://github.com/brentyi/jaxls.git",
+    "pyroki": "https://github.com/chungmin99/pyroki.git",
+}
+"""Adapter -> where its library is; what PyPI has under that name, if anything, is another one."""
 
 
 def __getattr__(name: str) -> ModuleType:
@@ -64,11 +87,18 @@ def __getattr__(name: str) -> ModuleType:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
         return importlib.import_module(f"hiosdf_jax._src.planning.adapters.{name}")
-    except ModuleNotFoundError as error:
+    except ImportError as error:
+        if name in _REPOSITORIES:
+            how = f"{error}; pip install 'git+{_REPOSITORIES[name]}'"
+        elif isinstance(error, ModuleNotFoundError):
+            how = (
+                f"there is no module {error.name!r}; "
+                f"in a clone of hiosdf_jax: pip install '.[plan]'"
+            )
+        else:
+            raise
         raise ModuleNotFoundError(
-            f"{__name__}.{name} needs {_ADAPTERS[name]}, but there is no module {error.name!r}; "
-            f"in a clone of hiosdf_jax: pip install '.[plan]'",
-            name=error.name,
+            f"{__name__}.{name} needs {_ADAPTERS[name]}, but {how}", name=error.name
         ) from error
 
 

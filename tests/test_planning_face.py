@@ -1,12 +1,15 @@
 """The public face of planning: one default policy, lazy adapters, examples that run."""
 
 import inspect
+import re
 import subprocess
 import sys
 import textwrap
 import warnings
 from pathlib import Path
+from types import ModuleType
 
+import git_packages
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -17,9 +20,19 @@ from analytic import half_space
 import hiosdf_jax as hio
 from hiosdf_jax import planning
 
-ADAPTERS = {"cbf": "cbfpy", "frax": "frax", "mjx": "mujoco", "mppi": "jax_mppi"}
+ADAPTERS = {
+    "cbf": "cbfpy",
+    "frax": "frax",
+    "hydrax": "hydrax",
+    "jaxls": "jaxls",
+    "mjx": "mujoco",
+    "mppi": "jax_mppi",
+    "pyroki": "pyroki",
+}
+REPOSITORIES = {"hydrax": "vincekurtz", "jaxls": "brentyi", "pyroki": "chungmin99"}
 EXAMPLES = [
     "sphere_clearance",
+    "clearance_and_jacobian",
     "robot_clearance",
     "robot_clearance_and_grad",
     "swept_clearance",
@@ -31,6 +44,11 @@ EXAMPLES = [
     "cbf.velocity_filter",
     "frax.arm_clearance",
 ]
+
+
+@pytest.fixture(autouse=True)
+def stand_ins(monkeypatch):
+    git_packages.install(monkeypatch, *REPOSITORIES)
 
 
 def adapter(name):
@@ -54,14 +72,18 @@ def defaults_of_unknown(module, names):
 
 def test_unseen_space_is_an_obstacle_by_default():
     defaults = defaults_of_unknown(planning, planning.__all__)
-    assert len(defaults) == 7
+    assert len(defaults) == 8
     assert set(defaults.values()) == {"obstacle"}
 
 
-@pytest.mark.parametrize(("name", "functions"), [("cbf", 1), ("frax", 2), ("mjx", 0), ("mppi", 0)])
+@pytest.mark.parametrize(
+    ("name", "functions"),
+    (dict.fromkeys(ADAPTERS, 0) | {"cbf": 1, "frax": 2, "jaxls": 2}).items(),
+)
 def test_unseen_space_is_an_obstacle_by_default_in_adapters(name, functions):
     module = adapter(name)
-    public = [key for key, value in vars(module).items() if inspect.getmodule(value) is module]
+    own = [key for key, value in vars(module).items() if inspect.getmodule(value) is module]
+    public = [key for key in own if not key.startswith("_")]
     defaults = defaults_of_unknown(module, public)
     assert len(defaults) == functions
     assert set(defaults.values()) <= {"obstacle"}
@@ -72,7 +94,9 @@ def test_planning_imports_no_optional_library():
 import sys
 class Refuse:
     def find_spec(self, name, *_):
-        if name.split(".")[0] in ("mujoco", "trimesh", "cbfpy", "frax", "jax_mppi"):
+        if name.split(".")[0] in (
+            "mujoco", "trimesh", "cbfpy", "frax", "jax_mppi", "jaxls", "pyroki", "hydrax"
+        ):
             raise ImportError(name)
 sys.meta_path.insert(0, Refuse())
 from hiosdf_jax import planning
@@ -99,6 +123,29 @@ def test_a_missing_library_is_named_with_how_to_install_it(name, monkeypatch):
         getattr(planning, name)
     assert caught.value.name == ADAPTERS[name]
     assert name not in dir(planning)
+
+
+def forget(name, monkeypatch):
+    for module in [each for each in sys.modules if each.partition(".")[0] == name]:
+        monkeypatch.delitem(sys.modules, module)
+
+
+@pytest.mark.parametrize("name", REPOSITORIES)
+def test_a_library_that_pypi_lacks_is_named_with_its_repository(name, monkeypatch):
+    forget(name, monkeypatch)
+    monkeypatch.setitem(sys.modules, name, None)
+    url = f"https://github.com/{REPOSITORIES[name]}/{name}.git"
+    with pytest.raises(ModuleNotFoundError, match=re.escape(f"pip install 'git+{url}'")):
+        getattr(planning, name)
+    assert name not in dir(planning)
+
+
+@pytest.mark.parametrize("name", REPOSITORIES)
+def test_another_package_of_the_same_name_is_seen(name, monkeypatch):
+    forget(name, monkeypatch)
+    monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    with pytest.raises(ModuleNotFoundError, match=rf"needs {name}, but .*'git\+https"):
+        getattr(planning, name)
 
 
 def test_other_names_are_unknown():

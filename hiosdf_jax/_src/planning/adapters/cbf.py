@@ -12,11 +12,9 @@ import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown
 from hiosdf_jax._src.numerics.intake import as_number, as_real
+from hiosdf_jax._src.planning.body import BodySpheres
 from hiosdf_jax._src.planning.clearance import checked_spheres, sphere_clearance
 from hiosdf_jax._src.state import Baked, Bound
-
-BodySpheres = Callable[[jax.Array], tuple[jax.Array, Any]]
-"""Configuration (n,) -> the body's spheres: centers_world (S, 3) m and radii (S,) m."""
 
 _PENALTY = 100.0
 _TOLERANCE = 1e-3
