@@ -110,22 +110,31 @@ print("hits in the voxels with a patch, median:", int(np.median(evidence.hits[ha
 
 # %%
 cloud, pose = (jnp.asarray(part, jnp.float32) for part in stream[3])
-placed = place_cloud(config, cloud, jnp.isfinite(cloud).all(axis=-1), pose, None)
-from_grid = sample_grid(config, state.grid, jax.random.key(0))
-from_cloud = sample_cloud(config, placed, jax.random.key(1))
-in_layer = (jnp.abs(from_grid.points_world[:, 2] - 1.2) < 0.1) & (from_grid.weight > 0)
+
+
+@jax.jit
+def draw_samples(grid, cloud, pose):
+    placed = place_cloud(config, cloud, jnp.isfinite(cloud).all(axis=-1), pose, None)
+    return (
+        sample_grid(config, grid, jax.random.key(0)),
+        sample_cloud(config, placed, jax.random.key(1)),
+    )
+
+
+from_grid, from_cloud = jax.tree.map(np.asarray, draw_samples(state.grid, cloud, pose))
+in_layer = (np.abs(from_grid.points_world[:, 2] - 1.2) < 0.1) & (from_grid.weight > 0)
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.8), dpi=80, layout="constrained")
 axes[0].set(title="samples of the grid, z = 1.1 to 1.3 m")
 axes[1].set(title="samples of one cloud, seen from above")
 for axis, samples, chosen in (
-    (axes[0], from_grid, np.asarray(in_layer)),
-    (axes[1], from_cloud, np.asarray(from_cloud.weight > 0)),
+    (axes[0], from_grid, in_layer),
+    (axes[1], from_cloud, from_cloud.weight > 0),
 ):
     limit = 1.0 if axis is axes[0] else 0.2
     dots = axis.scatter(
-        *np.asarray(samples.points_world)[chosen, :2].T,
-        c=np.asarray(samples.sdf)[chosen],
+        *samples.points_world[chosen, :2].T,
+        c=samples.sdf[chosen],
         s=6,
         cmap="RdBu",
         vmin=-limit,
@@ -169,7 +178,8 @@ field = hio.snapshot(state)
 x, y = np.meshgrid(np.linspace(0, 10, 200), np.linspace(0, 4.4, 88))
 plane = np.stack([x, y, np.full_like(x, 1.2)], axis=-1).astype(np.float32)
 exact = demo.signed_distance(stream.model, plane.reshape(-1, 3))[0].reshape(x.shape)
-scored = np.asarray(hio.query(field, plane).observed) & (exact > 0)
+is_observed = jax.jit(lambda field, points: hio.query(field, points).observed)
+scored = np.asarray(is_observed(field, plane)) & (exact > 0)
 
 figure, axes = plt.subplots(
     3, 1, figsize=(8, 10), dpi=80, sharex=True, sharey=True, layout="constrained"
