@@ -16,8 +16,10 @@ _PAGES = {
     "index.md": "README.md",
     "CHANGELOG.md": "CHANGELOG.md",
     "CONTRIBUTING.md": "CONTRIBUTING.md",
-    "notebooks/quickstart.md": "notebooks/quickstart.ipynb",
-    "notebooks/own_data.md": "notebooks/own_data.ipynb",
+    **{
+        f"notebooks/{name}.md": f"notebooks/{name}.ipynb"
+        for name in ("quickstart", "inside_the_method", "planning", "own_data", "thousand_maps")
+    },
 }
 _MODULES = ("planning", "datasets", "exports", "pictures", "scoring", "demo")
 _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
-import platform
 import sys
 import time
 import traceback
@@ -28,6 +26,7 @@ from benchmarks.speed.rows import (
     to_record,
 )
 from benchmarks.speed.setup import FULL, QUICK, Setup, open_setup
+from hiosdf_jax._src.command.timing import host_name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             records.write(options.output, record)  # a run that is cut off leaves its start
     device = jax.devices()[0].device_kind
     print(
-        f"{options.stream.stem}, {device}, {_host()}, jax {jax.__version__}, {took_s:.0f} s in all"
+        f"{options.stream.stem}, {device}, {host_name()}, jax {jax.__version__}, "
+        f"{took_s:.0f} s in all"
     )
     print(format_table(rows, baselines))
     print(f"wrote {options.output}")
@@ -89,7 +89,7 @@ def _run(setup: Setup, name: str, task: Task) -> Measured:
 
 
 def _record(setup: Setup, rows: Sequence[Row], baselines: Baselines, took_s: float) -> Any:
-    head = {"stream": setup.path.stem, "host": _host(), "took_s": records.rounded(took_s)}
+    head = {"stream": setup.path.stem, "host": host_name(), "took_s": records.rounded(took_s)}
     beside = {key: [to_record(one) for one in found] for key, found in baselines.items()}
     return (
         head
@@ -100,14 +100,6 @@ def _record(setup: Setup, rows: Sequence[Row], baselines: Baselines, took_s: flo
             "baselines": beside,
         }
     )
-
-
-def _host() -> str:
-    """Names the host's processor and counts its cores."""
-    known = Path("/proc/cpuinfo")
-    lines = known.read_text("utf-8").splitlines() if known.is_file() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{[*models, platform.processor()][0]}, {os.cpu_count()} cores"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -12,6 +12,7 @@ import hiosdf_jax as hio
 from benchmarks.speed import baselines, limits
 from benchmarks.speed.rows import Measured, time_ms
 from benchmarks.variants import VARIANTS
+from hiosdf_jax._src.command.timing import points_in
 from hiosdf_jax._src.config import Bounds
 from hiosdf_jax._src.network import training
 from hiosdf_jax._src.samples.draw import Samples
@@ -86,12 +87,6 @@ def query_paper(bounds: Bounds, count: int, machine: limits.Limits, seconds: flo
     name = f"sdf and gradient of {count:,}, the paper's network"
     row = limits.row(machine, name, spread, work, "network query")
     return Measured([row], {"network query": beside})
-
-
-def points_in(config: hio.Config, count: int) -> jax.Array:
-    """Draws points uniformly in the bounds, (count, 3) m."""
-    low, high = jnp.asarray(config.bounds, jnp.float32)
-    return low + jax.random.uniform(jax.random.key(0), (count, 3)) * (high - low)
 
 
 def _trainer(config: hio.Config) -> Callable[..., Any]:

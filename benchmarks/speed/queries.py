@@ -10,10 +10,10 @@ import jax
 
 import hiosdf_jax as hio
 from benchmarks.speed import limits
-from benchmarks.speed.networks import points_in
 from benchmarks.speed.rows import Baseline, Measured, Row, Spread, time_ms
 from benchmarks.speed.setup import Sizes
 from benchmarks.variants import VARIANTS
+from hiosdf_jax._src.command.timing import points_in
 from hiosdf_jax._src.state import MapState
 
 

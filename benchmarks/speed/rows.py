@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 
 from benchmarks import records
+from hiosdf_jax._src.command.timing import format_number, time_calls
 from hiosdf_jax.scoring import lay_out
 
 
@@ -120,14 +120,7 @@ def time_ms(
     Returns:
         The times, ms.
     """
-    for _ in range(2):
-        block(function(*arguments))
-    times, end = [], time.perf_counter() + seconds
-    while len(times) < 5 or (len(times) < 300 and time.perf_counter() < end):
-        start = time.perf_counter()
-        block(function(*arguments))
-        times.append(1e3 * (time.perf_counter() - start))
-    return spread_of(times)
+    return spread_of(time_calls(function, *arguments, seconds=seconds, block=block))
 
 
 def format_table(rows: Sequence[Row], baselines: Baselines) -> str:
@@ -180,11 +173,3 @@ def _compare(spread: Spread | None, baseline: Baseline) -> tuple[str, str, str]:
         return f"{baseline.name}: {baseline.reason}", "none", ""
     multiple = "" if spread is None else format_number(spread.median / baseline.spread.median)
     return baseline.name, format_number(baseline.spread.median), multiple
-
-
-def format_number(value: float) -> str:
-    """Writes a number with three significant digits, or more before the point."""
-    if not math.isfinite(value):
-        return str(value)
-    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
-    return f"{value:,.{min(digits, 6)}f}"

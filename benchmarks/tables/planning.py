@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from benchmarks import records
-from benchmarks.speed.rows import format_number
 from benchmarks.tables.markdown import lay_out
+from hiosdf_jax._src.command.timing import format_number
 
 
 def clearances() -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks import records
-from benchmarks.speed.rows import format_number
 from benchmarks.tables.markdown import lay_out
+from hiosdf_jax._src.command.timing import format_number
 from hiosdf_jax._src.mapping.stages import STAGES
 
 _QUERY = "sdf and gradient of 102,400"

@@ -20,6 +20,7 @@ examples:
   hiosdf view map.npz                   show a saved map in a browser
   hiosdf export map.npz --to map.vti    write it for ParaView, ROS, Blender, numpy
   hiosdf info map.npz                   what a saved map is, in plain words
+  hiosdf bench                          how fast it is on this machine
 """
 _DEMO_EXAMPLES = """\
 examples:
@@ -92,6 +93,14 @@ examples:
   hiosdf eval map.npz house_depth.npz --to metrics.json      and as JSON
 """
 
+_BENCH_EXAMPLES = """\
+examples:
+  hiosdf bench                        with the configuration that suits the device
+  hiosdf bench --json bench.json      and as JSON
+  JAX_COMPILATION_CACHE_DIR=~/.cache/jax hiosdf bench
+      twice: the second run reads the compiled functions from the folder
+"""
+
 
 def parser_of(
     commands: Mapping[str, Callable[[argparse.Namespace], None]],
@@ -113,13 +122,14 @@ def parser_of(
         formatter_class=help_style,
     )
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument(
+    sized = argparse.ArgumentParser(add_help=False)
+    sized.add_argument(
         "--config",
         choices=("light", "paper", "default"),
         help="size of the map: light suits a CPU, default a GPU, paper has the paper's numbers "
         "(default: light on a CPU, default on a GPU)",
     )
+    common = argparse.ArgumentParser(add_help=False, parents=[sized])
     common.add_argument("--seed", type=_whole(0), help="seed of all randomness (default: 0)")
     common.add_argument(
         "--save",
@@ -355,6 +365,18 @@ def parser_of(
     )
     info.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
     info.set_defaults(command=commands["info"])
+
+    bench = subparsers.add_parser(
+        "bench",
+        parents=[sized],
+        help="how fast it is on this machine",
+        description="Measure updates and queries of a map of the demo's apartment. It takes about\n"
+        "a minute on two CPU cores.",
+        epilog=_BENCH_EXAMPLES,
+        formatter_class=help_style,
+    )
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON, too")
+    bench.set_defaults(command=commands["bench"])
     return parser
 
 

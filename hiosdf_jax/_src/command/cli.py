@@ -1,4 +1,4 @@
-"""The `hiosdf` command: `hiosdf demo | map | eval | view | export | info`."""
+"""The `hiosdf` command: `hiosdf demo | map | eval | view | export | info | bench`."""
 
 from __future__ import annotations
 
@@ -334,6 +334,23 @@ def _info(options: argparse.Namespace) -> None:
     print(_checked(lambda: describe_map(options.map, state)))
 
 
+def _bench(options: argparse.Namespace) -> None:
+    if options.json is not None:
+        _checked(lambda: check_output(options.json))
+    from hiosdf_jax._src.command import bench
+    from hiosdf_jax._src.command.report import write_json
+    from hiosdf_jax._src.demo import apartment
+
+    stream = apartment.ApartmentStream(frames=bench.FRAMES)
+    config = _configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)
+    _begin("updates and queries of a map of the demo's apartment, about a minute on two CPU cores")
+    record = bench.measure(stream, config)
+    print(bench.format_record(record))
+    if options.json is not None:
+        write_json(options.json, record)
+        print(f"\nwrote {options.json}")
+
+
 def _check_outputs(options: argparse.Namespace, output: Path) -> None:
     """Raises a failure for outputs that cannot be written, before any work."""
     from hiosdf_jax._src.command.map_stream import RESULTS, UNFINISHED
@@ -590,4 +607,5 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "view": _view,
     "export": _export,
     "info": _info,
+    "bench": _bench,
 }
