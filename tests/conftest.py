@@ -1,6 +1,7 @@
 """Shared compilations and maps: most of the time of these tests is spent in XLA's compiler."""
 
 import os
+import signal
 from pathlib import Path
 
 import jax
@@ -22,6 +23,18 @@ import hiosdf_jax as hio
 # XLA crashes without more.
 _MAPS = Path("/proc/self/maps")
 _MOST_MAPS = 40_000
+
+
+@pytest.fixture(autouse=True)
+def signals_of_a_terminal():
+    """Ends what `nohup` and a shell's `&` do: commands leave signals alone that are ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    ignored = [number for number in usual if signal.getsignal(number) == signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, usual[number])
+    yield
+    for number in ignored:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @pytest.fixture(autouse=True, scope="module")
