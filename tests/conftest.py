@@ -13,7 +13,7 @@ _cache = os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "d" / "jax")
 )
 jax.config.update("jax_compilation_cache_dir", _cache)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # there are thousands
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # thousands are small
 
 from room import CONFIG, map_of_room
 
@@ -27,7 +27,7 @@ _MOST_MAPS = 40_000
 
 @pytest.fixture(autouse=True)
 def signals_of_a_terminal():
-    """Ends what `nohup` and a shell's `&` do: commands leave signals alone that are ignored."""
+    """Restores signals that `nohup` or a shell's `&` ignores: commands leave those ignored."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
     ignored = [number for number in usual if signal.getsignal(number) == signal.SIG_IGN]
     for number in ignored:

@@ -44,12 +44,12 @@ def measure(
         seconds: How long to repeat each query.
 
     Returns:
-        What `metrics.json` would have: the device, the host, versions, and `rows` of name, unit and
-        value, with 10 % and 90 % quantiles of what was repeated.
+        The record: the device, the host, versions, and `rows` of name, unit and value, with 10 %
+        and 90 % quantiles for what was repeated.
     """
     from tqdm import tqdm
 
-    bar = tqdm(total=2 * len(stream) + 3, desc="rendering", leave=False)
+    bar = tqdm(total=2 * len(stream) + 2, desc="rendering", leave=False)
 
     def step(then: str) -> None:
         bar.update()
@@ -115,15 +115,15 @@ def format_record(record: dict[str, Any]) -> str:
     Returns:
         A table, and lines that say what it was measured on.
     """
-    cells = [["", "unit", "median", "10 % below", "90 % below"]]
+    cells = [["", "unit", "value", "10 % below", "90 % below"]]
     for row in record["rows"]:
         values = [row.get(key) for key in ("value", "p10", "p90")]
         numbers = ["" if each is None else format_number(each) for each in values]
         cells.append([row["name"], row["unit"], *numbers])
     voxels = " x ".join(map(str, record["voxels"]))
-    cached = "it compiles; with JAX_COMPILATION_CACHE_DIR set, later runs read the result"
+    cached = "compiles; with JAX_COMPILATION_CACHE_DIR set, later runs read the result"
     if record["compilation_cache"]:
-        cached = "it compiles, or reads JAX's compilation cache"
+        cached = "compiles, or reads JAX's compilation cache"
     return "\n".join(
         [
             lay_out(cells, text_columns=2),

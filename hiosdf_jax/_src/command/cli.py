@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except RuntimeError as error:  # what JAX raises, whose import takes a second
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
-            print("hiosdf: out of memory; a smaller --bounds takes less", file=sys.stderr)
+            print("hiosdf: out of memory; a smaller map takes less", file=sys.stderr)
             return _BAD_INPUT
         except KeyboardInterrupt:
             print("hiosdf: stopped; nothing was written", file=sys.stderr)

@@ -62,4 +62,4 @@ def clearance_and_jacobian(
 
     by_configuration, (centers_world, radii) = jax.jacfwd(placed, has_aux=True)(q)
     clearance, grad = sphere_clearance_and_grad(field, centers_world, radii, unknown, bound)
-    return clearance, jnp.einsum("si,sin->sn", grad, by_configuration)
+    return clearance, jnp.einsum("si,sin->sn", grad, by_configuration.astype(jnp.float32))

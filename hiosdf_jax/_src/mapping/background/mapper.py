@@ -54,9 +54,9 @@ class BackgroundMapper:
     persistent cache has it (`JAX_COMPILATION_CACHE_DIR`), and `wait` and `close` bring the map
     back. If that process is killed, what it has mapped since the last `wait` is lost.
 
-    When the interpreter exits, the frame that is being fused is given up: within seconds on Linux,
-    also while XLA compiles; elsewhere when XLA is done. A process is killed, and also ends if its
-    parent is killed.
+    When the interpreter exits, the frame that is being fused is given up: within seconds where the
+    C library is glibc, even while XLA compiles. Elsewhere the exit waits for XLA. A process is
+    killed, and also ends if its parent is killed.
 
     Reading `field` never waits and never raises. A controller that reads nothing else should stop
     where `age(now)` is too large, or `failure` is not None.

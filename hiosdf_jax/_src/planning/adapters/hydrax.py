@@ -1,6 +1,6 @@
 """Sampling-based control by `hydrax`, with the map as an argument of each step."""
 
-# Where hydrax is not installed, pyright takes this module for it.
+# Without hydrax, pyright resolves the import to this module itself.
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false
 

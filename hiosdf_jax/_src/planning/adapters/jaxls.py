@@ -1,6 +1,6 @@
 """Costs and hard constraints of `jaxls`, whose Jacobians take one query of the map."""
 
-# Where jaxls is not installed, pyright takes this module for it.
+# Without jaxls, pyright resolves the import to this module itself.
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false
 
@@ -119,7 +119,8 @@ def clearance_cost(
     weight = as_number("weight", weight, 0, above=True)
 
     def shortfall(clearance: jax.Array, jacobian: jax.Array) -> tuple[jax.Array, jax.Array]:
-        short = margin_m - clearance
+        # The square of the 1e30 m of NaN points would overflow.
+        short = jnp.minimum(margin_m - clearance, 1e6)
         near = short > 0
         return jnp.where(near, weight * short, 0), jnp.where(near[:, None], -weight * jacobian, 0)
 

@@ -1,6 +1,6 @@
 """The collision geometry of a `pyroki` robot as spheres, for costs and constraints on a map."""
 
-# Where pyroki is not installed, pyright takes this module for it.
+# Without pyroki, pyright resolves the import to this module itself.
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false
 
@@ -67,7 +67,8 @@ def robot_spheres(
     if is_traced(geometry.size):
         raise ValueError("collision is traced; call robot_spheres outside jit, its result inside")
     capsules = isinstance(geometry, Capsule)
-    along = np.linspace(-0.5, 0.5, spheres_per_capsule) if capsules else np.zeros(1)
+    count = spheres_per_capsule if capsules else 1
+    along = np.linspace(-0.5, 0.5, count, dtype=np.float32) if capsules else np.zeros(1, np.float32)
     # (links, geometries of a link, spheres of a geometry); pyroki fills up with radii of zero.
     size = np.asarray(geometry.size, float).reshape(len(names), -1, np.shape(geometry.size)[-1])
     spacing = size[..., 1] / (len(along) - 1) if capsules else 0.0
