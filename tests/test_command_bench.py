@@ -38,7 +38,7 @@ def test_every_figure_is_measured(record, room_map):
 def test_the_table_has_units_and_the_device(record):
     text = bench.format_record(record)
     head, _, first, *_ = text.splitlines()
-    assert head.split() == ["unit", "median", "10", "%", "below", "90", "%", "below"]
+    assert head.split() == ["unit", "value", "10", "%", "below", "90", "%", "below"]
     assert first.split()[:3] == ["first", "update", "s"]
     assert f"device {record['device']}, host {record['host']}, jax {jax.__version__}" in text
     assert "24 x 20 x 16 voxels" in text
