@@ -76,7 +76,7 @@ _REPOSITORIES = {
     "jaxls": "https://github.com/brentyi/jaxls.git",
     "pyroki": "https://github.com/chungmin99/pyroki.git",
 }
-"""Adapter -> where its library is; what PyPI has under that name, if anything, is another one."""
+"""Adapter -> its library's repository. A package of that name on PyPI is another one."""
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -202,7 +202,7 @@ plt.show()
 # still wrong in the kitchen, on which few updates have trained it. The blend is the grid's answer
 # with a tenth of the network's correction. It fades to the network beyond the grid's horizon and in
 # unseen space. Around the column all three are too far: no cloud has shown its other side yet.
-# [The benchmarks](../benchmarks/README.md#accuracy) leave out other parts, one at a time: local
+# [The benchmarks](../benchmarks/README.md#accuracy) leave out each other part in turn: local
 # samples, carving, the Eikonal loss.
 #
 # Continue with [planning on a map](planning.ipynb).

@@ -54,7 +54,7 @@ def is_running(pid):
         return False
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere it waits for XLA")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs glibc and /proc")
 @pytest.mark.parametrize("process, ending, runs", CASES)
 def test_a_script_that_does_not_close_its_mapper_ends(process, ending, runs, tmp_path):
     last_line, code = ENDINGS[ending]

@@ -67,8 +67,7 @@ def robot_spheres(
     if is_traced(geometry.size):
         raise ValueError("collision is traced; call robot_spheres outside jit, its result inside")
     capsules = isinstance(geometry, Capsule)
-    count = spheres_per_capsule if capsules else 1
-    along = np.linspace(-0.5, 0.5, count, dtype=np.float32) if capsules else np.zeros(1, np.float32)
+    along = np.linspace(-0.5, 0.5, spheres_per_capsule if capsules else 1, dtype=np.float32)
     # (links, geometries of a link, spheres of a geometry); pyroki fills up with radii of zero.
     size = np.asarray(geometry.size, float).reshape(len(names), -1, np.shape(geometry.size)[-1])
     spacing = size[..., 1] / (len(along) - 1) if capsules else 0.0
