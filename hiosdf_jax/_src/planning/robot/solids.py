@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hiosdf_jax._src.planning.robot.cover import Bounds, Solid
+from hiosdf_jax._src.planning.robot.cover import Bounds, Solid, lengths
 
 # Relative error that the search for the nearest point of a mesh may make.
 _SEARCH = 0.01
@@ -34,7 +34,7 @@ def cylinder(radius: float, half_length: float) -> Solid:
         value = distance_beyond(cylinder_profile(points, radius, half_length))
         return value, value
 
-    return Solid(distance, distance)
+    return Solid(distance, distance, distance)
 
 
 def cylinder_profile(points: np.ndarray, radius: float, half_length: float) -> np.ndarray:
@@ -61,8 +61,7 @@ def distance_beyond(faces: np.ndarray) -> np.ndarray:
     Returns:
         (N,) m.
     """
-    outside = np.maximum(faces, 0)
-    return np.sqrt(np.einsum("ij,ij->i", outside, outside)) + np.minimum(faces.max(axis=1), 0)
+    return lengths(np.maximum(faces, 0)) + np.minimum(faces.max(axis=1), 0)
 
 
 def ellipsoid(semi_axes: np.ndarray) -> Solid:
@@ -92,7 +91,7 @@ def ellipsoid(semi_axes: np.ndarray) -> Solid:
         value = np.linalg.norm(p - nearest, axis=1) * np.where(high > 0, 1, -1)
         return value, value
 
-    return Solid(distance, distance)
+    return Solid(distance, distance, distance)
 
 
 def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
@@ -158,26 +157,33 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
 
     def tight(points: np.ndarray) -> Bounds:
         # Approximate: exact searches from deep inside are slow.
-        far = np.asarray(tree.query(points, eps=_SEARCH, workers=-1)[0])
+        far = np.asarray(tree.query(points, eps=_SEARCH)[0])
         return signed(points, np.maximum(far / (1 + _SEARCH) - error, 0), far)
 
-    def quick(points: np.ndarray) -> Bounds:
+    def bound(points: np.ndarray) -> Bounds:
+        """Bounds of the distance by the lattice and the box around the mesh."""
         cell = np.clip(((points - corner) / pitch).astype(int), 0, counts - 1)
-        offset = np.linalg.norm(points - (corner + pitch * (cell + 0.5)), axis=1)
+        offset = lengths(points - (corner + pitch * (cell + 0.5)))
         center = pitch * np.asarray(steps)[tuple(cell.T)]
-        box = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1)
+        box = lengths(np.maximum(np.maximum(low - points, points - high), 0))
         near = np.maximum(np.maximum(center - offset - half_diagonal, box - error), 0)
-        far = center + offset + slack
+        return near, center + offset + slack
+
+    def quick(points: np.ndarray) -> Bounds:
+        near, far = bound(points)
         # Cheap where the surface is close, which is where it matters.
         close = np.nonzero(near < pitch)[0]
         if len(close):
             most = float(far[close].max())
-            found = tree.query(points[close], distance_upper_bound=most, workers=-1)[0]
+            found = tree.query(points[close], distance_upper_bound=most)[0]
             far[close] = np.minimum(far[close], found)
             near[close] = np.maximum(near[close], far[close] - error)
         return signed(points, near, far)
 
-    return Solid(tight, quick)
+    def rough(points: np.ndarray) -> Bounds:
+        return signed(points, *bound(points))
+
+    return Solid(tight, quick, rough)
 
 
 def _on_triangles(triangles: np.ndarray, error: float) -> np.ndarray:
