@@ -51,6 +51,25 @@ def test_stray_returns_against_a_loop(seed):
     assert not found[~np.asarray(rays.in_range)].any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_small_cloud_is_counted_the_same_by_pairs_and_by_table(monkeypatch, seed):
+    rng = np.random.default_rng(seed)
+    ranges = np.where(rng.random(1000) < 0.1, rng.uniform(0.01, 3, 1000), 2 + rng.random(1000) / 50)
+    rays = camera(1000, ranges, seed)
+    narrow = np.asarray(rays.directions_world) * (1, 0.5, 0.5)  # dense enough to have stray returns
+    narrow /= np.linalg.norm(narrow, axis=1, keepdims=True)
+    turned = narrow @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rays = rays._replace(
+        directions_world=jnp.float32(turned), in_range=jnp.asarray(rng.random(1000) < 0.9)
+    )
+    by_pairs = np.asarray(jax.jit(stray.find_stray)(rays))
+    monkeypatch.setattr(stray, "_MOST_BY_PAIRS", 0)
+    by_table = np.asarray(jax.jit(lambda rays: stray.find_stray(rays))(rays))
+    np.testing.assert_array_equal(by_pairs, by_table)
+    assert by_pairs.sum() > 10
+    assert np.mean(by_pairs != stray_by_a_loop(rays)) < 2e-3
+
+
 def test_outliers_of_a_dense_cloud_are_stray_and_thin_things_are_not():
     ranges = np.full(6000, 2.0)
     ranges[:30] = np.linspace(0.4, 1.4, 30)  # each on its own

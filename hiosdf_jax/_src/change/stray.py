@@ -27,6 +27,12 @@ _LEAST_AGREEING = 3
 _LEAST_SHARE = 0.015
 _LEAST_RETURNS = 120
 
+# Clouds up to this size are counted by pairs: a table of all cells and bins has 350,000 entries.
+_MOST_BY_PAIRS = 1024
+
+Place = tuple[jax.Array, jax.Array, jax.Array]
+"""Line and column of a return's cell, and its bin, (N,) int32 each."""
+
 
 def find_stray(rays: Rays) -> jax.Array:
     """Returns a mask of the stray returns.
@@ -40,20 +46,35 @@ def find_stray(rays: Rays) -> jax.Array:
     if rays.ends.size < _LEAST_RETURNS:
         return jnp.zeros(rays.ends.shape, bool)
     column, line = directions.pixel_coordinates(split(rays.directions_world))
-    edge, width = -(-directions.EDGE // _CELL_PIXELS) + 2, _BINS + 2
     logarithm = jnp.log(jnp.maximum(rays.free_ranges, _LEAST_RANGE_M) / _LEAST_RANGE_M)
+    bin_of = jnp.clip((_BINS_PER_E * logarithm).astype(jnp.int32), 0, _BINS - 1)
+    place = (line // _CELL_PIXELS, column // _CELL_PIXELS, bin_of)
+    count = _count_by_pairs if rays.ends.size <= _MOST_BY_PAIRS else _count_by_table
+    total, agreeing = count(rays.in_range, place)
+    needed = jnp.maximum(_LEAST_AGREEING, _LEAST_SHARE * total)
+    return rays.in_range & (total >= _LEAST_RETURNS) & (agreeing - 1 < needed)
+
+
+def _count_by_pairs(counted: jax.Array, place: Place) -> tuple[jax.Array, jax.Array]:
+    """Counts returns in the cells around each, and those in the bins around as well."""
+    line, column, bin_of = (jnp.abs(part[:, None] - part) <= 1 for part in place)
+    around = counted & line & column
+    return jnp.sum(around, axis=1), jnp.sum(around & bin_of, axis=1)
+
+
+def _count_by_table(counted: jax.Array, place: Place) -> tuple[jax.Array, jax.Array]:
+    """Counts the same; its cost grows with the number of returns, not with its square."""
     # A bin and a cell beside the first and the last one, so that all have neighbors.
-    bin_of = jnp.clip((_BINS_PER_E * logarithm).astype(jnp.int32), 0, _BINS - 1) + 1
-    cell = (line // _CELL_PIXELS + 1) * edge + column // _CELL_PIXELS + 1
+    edge, width = -(-directions.EDGE // _CELL_PIXELS) + 2, _BINS + 2
+    line, column, bin_of = (part + 1 for part in place)
+    cell = line * edge + column
 
     def count(place: jax.Array, size: int) -> jax.Array:
-        target = jnp.where(rays.in_range, place, size)
+        target = jnp.where(counted, place, size)
         return jnp.zeros(size, jnp.int32).at[target].add(1, mode="drop")
 
     step = np.arange(-1, 2)
     around = cell[:, None] + (step[:, None] * edge + step).ravel()
-    total = jnp.sum(count(cell, edge**2)[around], axis=1)
     bins = (around[..., None] * width + (bin_of[:, None] + step)[:, None]).reshape(-1, 27)
-    agreeing = jnp.sum(count(cell * width + bin_of, edge**2 * width)[bins], axis=1) - 1
-    needed = jnp.maximum(_LEAST_AGREEING, _LEAST_SHARE * total)
-    return rays.in_range & (total >= _LEAST_RETURNS) & (agreeing < needed)
+    total = jnp.sum(count(cell, edge**2)[around], axis=1)
+    return total, jnp.sum(count(cell * width + bin_of, edge**2 * width)[bins], axis=1)

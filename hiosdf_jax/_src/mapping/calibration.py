@@ -19,8 +19,8 @@ from hiosdf_jax._src.state import Field
 # Points on surfaces are the hardest: a bound that holds for 94.5 % of the surface holds for 99 % of
 # the points of free space.
 _QUANTILE = 0.945
-_RETURNS = 2000  # drawn per update
-_LEAST_RETURNS = 100  # needed for a quantile
+_RETURNS = 2000  # drawn per update, from clouds that have as many rows
+_LEAST_SHARE = 0.05  # of them are needed for a quantile
 _MEMORY = 0.98  # share of the old value in the average over updates
 _INITIAL = 3.0
 
@@ -46,7 +46,8 @@ def calibrate_bound(field: Field, rays: Rays, key: jax.Array) -> jax.Array:
     Returns:
         The new optimism, () float32.
     """
-    chosen, possible = draw_from_mask(rays.ends & rays.inside, _RETURNS, key)
+    count = min(_RETURNS, rays.ends.size)
+    chosen, possible = draw_from_mask(rays.ends & rays.inside, count, key)
     points_world = jnp.where(possible, rays.points_world[chosen], field.origin_world)
     observed = possible & (blend.frontier(field, points_world) > 0)
     cautious, scale = blend.cautious_sdf(field, points_world)
@@ -55,7 +56,7 @@ def calibrate_bound(field: Field, rays: Rays, key: jax.Array) -> jax.Array:
     newest = _weighted_quantile(cautious / scale, jnp.where(observed, square, 0), _QUANTILE)
     memory = jnp.minimum(_MEMORY, field.updates / (field.updates + 1.0))
     mixed = memory * field.optimism + (1 - memory) * newest
-    enough = jnp.sum(observed) >= _LEAST_RETURNS
+    enough = jnp.sum(observed) >= _LEAST_SHARE * count
     return jnp.maximum(jnp.where(enough, mixed, field.optimism), _LEAST)
 
 
