@@ -6,6 +6,7 @@ command with one line and not with a traceback.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from typing import NoReturn
@@ -15,6 +16,9 @@ def main() -> int:
     """Runs the command; see `hiosdf_jax._src.command.cli.main`."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as by nohup
         signal.signal(signal.SIGINT, _stop)  # until the command receives its signals itself
+    # Tracing makes many small objects. With Python's own thresholds, half of its time is garbage
+    # collection.
+    gc.set_threshold(100_000, 50, 100)
     from hiosdf_jax._src.command import cli
 
     return cli.main()

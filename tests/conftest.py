@@ -1,5 +1,6 @@
 """Shared compilations and maps: most of the time of these tests is spent in XLA's compiler."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -14,6 +15,9 @@ _cache = os.environ.setdefault(
 )
 jax.config.update("jax_compilation_cache_dir", _cache)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # thousands are small
+
+# Half of the time of tracing is garbage collection otherwise.
+gc.set_threshold(100_000, 50, 100)
 
 from room import CONFIG, map_of_room
 
