@@ -60,20 +60,10 @@ def test_rays_hit_where_those_of_mujoco_do(model):
     count = len(directions)
     for origin in ([0.1, 0.2, 0.3], [2.0, -2.0, 1.0], [-1.9, 1.9, -1.4]):
         ranges, geoms = np.empty(count), np.empty(count, np.int32)
-        mujoco.mj_multiRay(
-            m=model,
-            d=data,
-            pnt=np.array(origin),
-            vec=directions.ravel(),
-            geomgroup=None,
-            flg_static=True,
-            bodyexclude=-1,
-            geomid=geoms,
-            dist=ranges,
-            normal=None,
-            nray=count,
-            cutoff=mujoco.mjMAXVAL,
-        )
+        for k, direction in enumerate(directions):
+            ranges[k] = mujoco.mj_ray(
+                model, data, np.array(origin), direction, None, 1, -1, geoms[k : k + 1]
+            )
         mine, hit = WORLD.cast(np.array(origin), directions)
         np.testing.assert_array_equal(hit, geoms)
         assert (hit == BACKGROUND).any() and len(np.unique(hit)) >= 4

@@ -18,6 +18,7 @@ from benchmarks.robustness.scenes import frames_of, scan_all
 from benchmarks.robustness.sensors import Scan, Sensor, depth_camera, look_at
 from benchmarks.robustness.worlds import Box, Capsule, Thing, World
 from hiosdf_jax import demo
+from hiosdf_jax._src.demo.camera import cast_rays
 
 Rows = dict[str, measures.Figures]
 
@@ -46,22 +47,7 @@ class Apartment:
 
     def cast(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Ranges (n,) m along unit directions (n, 3); inf where a ray hits nothing."""
-        count = len(directions)
-        ranges, geoms = np.empty(count), np.empty(count, np.int32)
-        mujoco.mj_multiRay(
-            m=self._model,
-            d=self._data,
-            pnt=np.asarray(origin, np.float64),
-            vec=np.ascontiguousarray(directions, np.float64).ravel(),
-            geomgroup=None,
-            flg_static=True,
-            bodyexclude=-1,
-            geomid=geoms,
-            dist=ranges,
-            normal=None,
-            nray=count,
-            cutoff=mujoco.mjMAXVAL,
-        )
+        ranges, _ = cast_rays(self._model, self._data, origin, directions)
         return np.where(ranges < 0, np.inf, ranges)
 
     def distance(self, points: np.ndarray) -> np.ndarray:

@@ -100,33 +100,49 @@ class DepthCamera:
     def _cast(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depths (height * width,) m, and the geoms that the rays hit."""
         directions = (self._rays / self._lengths[:, None]) @ pose[:3, :3].T
-        count = len(directions)
-        ranges, geoms = np.empty(count), np.empty(count, np.int32)
-        if _ONE_BY_ONE:
-            for k, direction in enumerate(directions):
-                ranges[k] = mujoco.mj_ray(
-                    self._model, self._data, pose[:3, 3], direction, None, 1, -1, geoms[k : k + 1]
-                )
-            return ranges / self._lengths, geoms
-        mujoco.mj_multiRay(
-            m=self._model,
-            d=self._data,
-            pnt=pose[:3, 3],
-            vec=directions.ravel(),
-            geomgroup=None,  # every group
-            flg_static=True,  # static geoms included, and all of these are static
-            bodyexclude=-1,
-            geomid=geoms,
-            dist=ranges,
-            normal=None,
-            nray=count,
-            cutoff=mujoco.mjMAXVAL,
-        )
+        ranges, geoms = cast_rays(self._model, self._data, pose[:3, 3], directions)
         return ranges / self._lengths, geoms
 
     def _in_range(self, depth: np.ndarray) -> np.ndarray:
         ranges = depth * self._lengths
         return (ranges >= _MIN_RANGE) & (ranges <= self.max_range)
+
+
+def cast_rays(
+    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Casts rays from a point against all geoms of a model.
+
+    Args:
+        model: The model.
+        data: Its state after `mujoco.mj_forward`.
+        origin: (3,) m, world frame.
+        directions: (N, 3) unit vectors, world frame.
+
+    Returns:
+        Ranges (N,) m, and the geoms that the rays hit, (N,) int32; -1 and -1 where there is none.
+    """
+    count = len(directions)
+    ranges, geoms = np.empty(count), np.empty(count, np.int32)
+    if _ONE_BY_ONE:
+        for k, direction in enumerate(directions):
+            ranges[k] = mujoco.mj_ray(model, data, origin, direction, None, 1, -1, geoms[k : k + 1])
+        return ranges, geoms
+    mujoco.mj_multiRay(
+        m=model,
+        d=data,
+        pnt=np.asarray(origin, np.float64),
+        vec=np.ascontiguousarray(directions, np.float64).ravel(),
+        geomgroup=None,  # every group
+        flg_static=True,  # static geoms included
+        bodyexclude=-1,
+        geomid=geoms,
+        dist=ranges,
+        normal=None,
+        nray=count,
+        cutoff=mujoco.mjMAXVAL,
+    )
+    return ranges, geoms
 
 
 def _add_noise(depth: np.ndarray, seed: Any) -> np.ndarray:
