@@ -15,8 +15,11 @@ import numpy as np
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.planning.robot.solids import cylinder_profile, distance_beyond
 
-# Points per chunk: keeps the temporaries of one geom at a few megabytes.
-_CHUNK = 32768
+# Points per chunk: keeps the temporaries at about ten megabytes.
+_CHUNK = 4096
+
+# More than rounding adds to the distance of a center, m.
+_ROUNDING_M = 1e-9
 
 
 def signed_distance(
@@ -76,12 +79,17 @@ def _union(
     """Minimum over the geoms for one chunk; only the nearest geoms' gradients are computed."""
     best, winner = np.full(len(points), np.inf), np.zeros(len(points), int)
     kinds = model.geom_type.tolist()
+    # A geom lies in a sphere around its center, which belongs to it: most geoms cannot be nearest.
+    to_center = np.sqrt(sum((points[:, k] - positions[:, k, None]) ** 2 for k in range(3)))
+    least = to_center - model.geom_rbound[:, None] - _ROUNDING_M
+    most = to_center.min(axis=0) + _ROUNDING_M
     for geom, kind in enumerate(kinds):
-        local = (points - positions[geom]) @ rotations[geom]
+        rows = np.nonzero(least[geom] <= np.minimum(best, most))[0]
+        local = (points[rows] - positions[geom]) @ rotations[geom]
         distance = _PRIMITIVES[kind][0](local, model.geom_size[geom])
-        closer = distance < best
-        best[closer] = distance[closer]
-        winner[closer] = geom
+        closer = distance < best[rows]
+        best[rows[closer]] = distance[closer]
+        winner[rows[closer]] = geom
     grad = np.empty((len(points), 3))
     for geom in np.unique(winner):
         won = winner == geom
