@@ -39,7 +39,7 @@ from hiosdf_jax import datasets, demo, exports, pictures, scoring
 
 # %%
 folder = Path(tempfile.mkdtemp())
-stream = demo.ApartmentStream(frames=40)
+stream = demo.ApartmentStream(frames=24)
 height, width = stream.camera.height, stream.camera.width
 for i, (cloud, _) in enumerate(stream):
     depth_mm = np.nan_to_num(1000 * cloud[:, 2]).reshape(height, width)
@@ -97,7 +97,7 @@ plt.show()
 # %% [markdown]
 # ## The map
 # `bounds` is the box to map, in m. `datasets.find_bounds(frames)` finds it if you do not know it.
-# Every tenth frame is held out, to score the map.
+# Every eighth frame is held out, to score the map.
 
 # %%
 config = hio.Config.light(demo.BOUNDS_WORLD, max_range=6.0)
@@ -105,7 +105,7 @@ state = hio.init(config, jax.random.key(0))
 held_out_world = []
 for index in range(len(frames)):
     cloud, pose = frames[index]
-    if index % 10 == 9:
+    if index % 8 == 7:
         held_out_world.append(cloud @ pose[:3, :3].T + pose[:3, 3])
     else:
         state = hio.update(state, cloud, pose)

@@ -34,7 +34,7 @@ from hiosdf_jax import demo
 # rigid (4, 4) transform from the sensor to the world.
 
 # %%
-stream = demo.ApartmentStream(frames=40)
+stream = demo.ApartmentStream(frames=24)
 cloud, pose = stream[0]
 print(len(stream), "frames of", cloud.shape, "points, the first one from", pose[:3, 3], "m")
 
@@ -52,7 +52,7 @@ print(f"mean |f - s| of its training samples: {100 * float(state.report.sdf_loss
 print("flags so far:", repr(hio.Flag(int(state.report.flags))))
 
 # %% [markdown]
-# `POINTS_OUTSIDE` says that at least one return so far, here a noisy one, lay outside the bounds.
+# No flag: no cloud was refused, and no return in range lay outside the bounds.
 
 # %% [markdown]
 # ## Distances and gradients
