@@ -23,7 +23,8 @@ def has_colors(picture):
     return (np.ptp(part, axis=-1) > 30).mean() > 0.05
 
 
-def test_it_shows_the_map_and_the_slice_moves(sharp_map, tmp_path):
+def test_it_shows_the_map_and_the_slice_moves(sharp_map, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # the button writes a file there
     field = hio.snapshot(sharp_map)
     viewer = hio.view(field, port=0, spheres=([[0.0, 0.0, 0.2]], 0.1))
     try:
