@@ -1,5 +1,7 @@
 """The live view and its page in a real browser."""
 
+import time
+
 import browser
 import numpy as np
 import pytest
@@ -42,6 +44,10 @@ def test_it_shows_the_map_and_the_slice_moves(sharp_map, tmp_path, monkeypatch):
 
             page.wait_for(has_moved)
             page.click("export as HTML")
+            end = time.monotonic() + 60
+            while not (tmp_path / "scene.html").exists():
+                assert time.monotonic() < end, "the button has written nothing"
+                time.sleep(0.1)
             assert page.errors == []
     finally:
         viewer.close()
