@@ -22,8 +22,8 @@ _TOLERANCE_VOXELS = 1.5
 _FRONT_VOXELS = 2.0
 
 # Rays step by the distance that the map has stored, and half a voxel at least. Near walls that are
-# not met head-on the steps are short. Rays that have not
-# arrived after this number of steps pierce nothing.
+# not met head-on the steps are short. Rays that have not arrived after this number of steps pierce
+# nothing.
 _STEPS = 48
 
 

@@ -55,8 +55,10 @@ def save_growing(
     pictures = []
     for mesh, path_world in stages:
         pictures.append(_with_path(shade(mesh, view), view.pixels(path_world)))
-    # One palette for all; each with its own would flicker.
-    palette = pictures[-1].quantize(255)
+    # One palette for all, since each with its own would flicker. The path keeps its exact color.
+    palette = pictures[-1].quantize(254)
+    colors = (palette.getpalette() or [])[: 3 * 254]
+    palette.putpalette([*colors, *_PATH_COLOR])
     frames = [each.quantize(palette=palette, dither=0) for each in pictures]
     durations = [_FRAME_MS] * (len(frames) - 1) + [_LAST_MS]
     with replacing(path) as file:
