@@ -28,7 +28,7 @@ def unmapped(monkeypatch):
         pytest.fail("the work has begun")
 
     monkeypatch.setattr(map_stream, "run_stream", begin)
-    monkeypatch.setattr(cli, "_open", begin)
+    monkeypatch.setattr(cli, "open_inputs", begin)
 
 
 @pytest.fixture
