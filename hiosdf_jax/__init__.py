@@ -14,7 +14,7 @@ from hiosdf_jax._src.field.points import query, sdf, sdf_and_grad
 from hiosdf_jax._src.mapping.background.mapper import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
-from hiosdf_jax._src.mapping.merging import correct, merge, transform
+from hiosdf_jax._src.mapping.joining.merging import correct, merge, transform
 from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose

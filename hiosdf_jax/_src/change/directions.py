@@ -186,6 +186,8 @@ def smoothness(rays: Rays, chosen: jax.Array) -> jax.Array:
         Of the pixels with chosen rays, and with several ranges in the 3 x 3 pixels around: the
         share where these are within 20 %, () float32; `UNKNOWN` if there are few such pixels.
     """
+    if rays.in_range.size < _LEAST_PIXELS:
+        return jnp.float32(UNKNOWN)
     image = range_image(rays, rays.in_range)
     both = jnp.stack([image.nearest, -image.farthest]).reshape(2, EDGE, EDGE)
     nearest, farthest = _pool(both, jnp.inf, jax.lax.min, 1).reshape(2, EDGE**2)

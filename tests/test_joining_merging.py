@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid import patches
-from hiosdf_jax._src.mapping import merging
+from hiosdf_jax._src.mapping.joining import merging
 
 EYE = np.eye(4, dtype=np.float32)
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 3)).astype(np.float32)

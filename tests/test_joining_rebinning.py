@@ -10,7 +10,8 @@ from room import arrays_equal
 from scipy.spatial.transform import Rotation
 from voxels import BOUNDS, CONFIG, SHAPE, empty_window, fade_evidence, fuse, trace, uniform
 
-from hiosdf_jax._src.grid import evidence, patches, rebinning
+from hiosdf_jax._src.grid import evidence, patches
+from hiosdf_jax._src.mapping.joining import rebinning
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 
 TARGET = dataclasses.replace(CONFIG, bounds=((-1.3, -1.4, -1.1), (1.5, 1.6, 2.0)))
@@ -177,3 +178,33 @@ def test_what_leaves_the_box_is_lost_and_harms_nothing(stored):
     kept = np.asarray(stored.hits, float)[:8].sum()
     assert 0 < kept == np.asarray(half.hits, float).sum()
     assert BOUNDS[1][0] + 1.0 > TARGET.bounds[1][0]
+
+
+def test_passes_are_looked_up_in_the_voxel_that_holds_the_point(stored):
+    offset = uniform(5, int(np.prod(TARGET.grid_shape)), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    offset = np.asarray(offset).reshape(*TARGET.grid_shape, 3)
+    pose = jnp.asarray(POSE, jnp.float32)
+    found = np.asarray(rebinning.passes_at(CONFIG, stored, TARGET, pose, jnp.asarray(offset)))
+    back, passes = np.linalg.inv(POSE), np.abs(np.asarray(stored.passes, float))
+    points = np.argwhere(np.ones(TARGET.grid_shape)) + TARGET.corner_index + 0.5
+    points = (points + offset.reshape(-1, 3)) @ back[:3, :3].T + 10 * back[:3, 3]
+    cells = np.floor(points).astype(int) - np.array(CONFIG.corner_index)
+    inside = ((cells >= 0) & (cells < SHAPE)).all(axis=1)
+    expected = np.where(inside, passes[tuple(np.where(inside[:, None], cells, 0).T)], 0)
+    near_border = np.abs(points - np.round(points)).min(axis=1) < 1e-4
+    np.testing.assert_array_equal(found.ravel()[~near_border], expected[~near_border])
+    assert (expected > 0).sum() > 100
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift", "expected"),
+    [
+        ((0, 0, 0), (0.3, -0.2, 0.4), True),
+        ((0, 0, np.pi / 2), (0.0, 12.1, 0.0), True),
+        ((0, np.pi, 0), (0.0, 0.0, 0.05), False),
+        ((0, 0, 0.01), (0.0, 0.0, 0.0), False),
+    ],
+)
+def test_only_whole_voxels_and_quarter_turns_coincide(turn, shift, expected):
+    pose = rigid(Rotation.from_rotvec(turn).as_matrix(), shift)
+    assert bool(rebinning.coincides(TARGET, jnp.asarray(pose, jnp.float32))) == expected

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid.adding import sum_evidence
 from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid, whole_window, write_window
 from hiosdf_jax._src.grid.frontier import recompute_frontier
-from hiosdf_jax._src.grid.rebinning import rebin
+from hiosdf_jax._src.mapping.joining.adding import Moved, sum_evidence
+from hiosdf_jax._src.mapping.joining.rebinning import coincides, passes_at, rebin
 from hiosdf_jax._src.network.frames import move_network
 from hiosdf_jax._src.network.training import least_epochs, train
 from hiosdf_jax._src.numerics.intake import as_array, is_traced
@@ -154,7 +154,7 @@ def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) 
     if len(parts) > 1:
         used = [ok & (state.updates > 0) for ok, state in zip(good, states, strict=True)]
 
-    windows, networks = [], []
+    windows, moved, networks = [], [], []
     for (state, pose), ok, use in zip(parts, good, used, strict=True):
         exact = None if pose is None else _exact(jnp.where(ok, pose, eye))
         networks.append(state.network if exact is None else move_network(state.network, exact))
@@ -162,8 +162,10 @@ def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) 
         window = whole_window(known) if exact is None else rebin(state.config, known, config, exact)
         window = jax.tree.map(lambda x, use=use: jnp.where(use, x, jnp.zeros_like(x)), window)
         windows.append(window)
+        moved.append(None if exact is None else _moved(state, config, exact, use))
     empty = empty_grid(config)
-    grid = empty.replace(evidence=write_window(empty.evidence, sum_evidence(config, windows)))
+    total = sum_evidence(config, windows, moved)
+    grid = empty.replace(evidence=write_window(empty.evidence, total))
     grid = recompute_frontier(config, recompute_distances(config, grid))
 
     # The network of the first map that has learned anything.
@@ -197,6 +199,16 @@ def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) 
         report=report,
     )
     return jax.tree.map(jnp.copy, result)  # so that each map can be donated
+
+
+def _moved(state: MapState, config: Config, pose: jax.Array, used: jax.Array) -> Moved:
+    """Describes where a map at a pose T_new_old lies in the voxels of a joined grid."""
+
+    def look_up(offset: jax.Array) -> jax.Array:
+        passes = passes_at(state.config, state.grid.evidence, config, pose, offset)
+        return jnp.where(used, passes, 0)
+
+    return Moved(coincides(config, pose) | ~used, look_up)
 
 
 _join_jit = jax.jit(_join, static_argnums=0)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from voxels import CONFIG, SHAPE, empty_window, fuse, trace, uniform
 
-from hiosdf_jax._src.grid import adding, patches
+from hiosdf_jax._src.grid import patches
+from hiosdf_jax._src.mapping.joining import adding
 
 sum_evidence = jax.jit(adding.sum_evidence, static_argnums=0)
 SENSOR = np.array([0.31, 0.52, 0.63])

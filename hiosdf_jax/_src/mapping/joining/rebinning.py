@@ -25,6 +25,9 @@ _INNER = 0.999
 # Voxels overlap if they do so by more than this, voxels. Rounding must not make neighbors overlap.
 _OVERLAP_VOXELS = 0.01
 
+# A pose moves voxels onto voxels up to this error, voxels.
+_ROUNDING = 1e-3
+
 # A voxel that is observed by hits alone counts this many passes: it is seen, and not free.
 _SEEN = 2.0**-8
 
@@ -68,6 +71,49 @@ def rebin(source: Config, evidence: Evidence, target: Config, pose: jax.Array) -
     )
     surface = (level == _SURFACE).reshape(shape)
     return patches.keep_surfaces(target, fade_evidence(target, window), surface)
+
+
+def coincides(target: Config, pose: jax.Array) -> jax.Array:
+    """Returns whether a pose moves voxels onto voxels, () bool.
+
+    Args:
+        target: The configuration of the new grid.
+        pose: (4, 4) T_target_source, its rotation exact to rounding.
+    """
+    shift = pose[:3, 3] / target.voxel_size
+    turned = jnp.abs(pose[:3, :3] - jnp.round(pose[:3, :3]))
+    shifted = jnp.abs(shift - jnp.round(shift))
+    return (jnp.max(turned) < _ROUNDING) & (jnp.max(shifted) < _ROUNDING)
+
+
+def passes_at(
+    source: Config, evidence: Evidence, target: Config, pose: jax.Array, offset: jax.Array
+) -> jax.Array:
+    """Looks up how many rays passed points of the new grid.
+
+    Args:
+        source: The configuration of the grid.
+        evidence: Its evidence.
+        target: The configuration of the new grid.
+        pose: (4, 4) T_target_source, its rotation exact to rounding.
+        offset: A point in each voxel of the new grid, from the voxel's center, (X, Y, Z, 3) voxels.
+
+    Returns:
+        The passes of the voxels of the grid that contain the points, (X, Y, Z); 0 outside of it.
+    """
+    shape = target.grid_shape
+    row = jnp.arange(shape[0] * shape[1] * shape[2], dtype=jnp.int32)
+    point = each(
+        jnp.add,
+        _center(target, geometry.unflatten(shape, row)),
+        split(offset.reshape(-1, 3).astype(jnp.float32)),
+    )
+    shift = split(pose[:3, 3] / target.voxel_size)
+    point = _rotated(pose[:3, :3].T, each(jnp.subtract, point, shift))
+    index, inside = _index_of(source, each(jnp.floor, point))
+    passes = jnp.abs(evidence.passes.ravel().astype(jnp.float32))
+    found = passes[geometry.flat_index(source.grid_shape, index)]
+    return jnp.where(inside, found, 0).reshape(shape)
 
 
 class _FreeSpace(NamedTuple):

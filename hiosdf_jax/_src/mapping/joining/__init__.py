@@ -1,0 +1,1 @@
+"""Maps that move, and maps that become one."""

@@ -1,0 +1,150 @@
+"""Patches that lie on a surer patch of another map, against float64; what is never dropped."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from voxels import CONFIG, SHAPE, empty_window
+
+from hiosdf_jax._src.grid import patches
+from hiosdf_jax._src.mapping.joining import adding, doubles
+
+drop_doubles = jax.jit(doubles.drop_doubles, static_argnums=0)
+NAMES = ("hits", "passes", "behind", "weight", "change", "mean", "axes")
+
+
+def window_of(cells, mean, axes, hits=5.0, weight=None, passes=1.0):
+    """Evidence with some patches; all other voxels are free."""
+    at = tuple(np.transpose(cells))
+    numbers = {"hits": hits, "weight": hits if weight is None else weight, "passes": passes}
+    window = empty_window()._replace(passes=jnp.full(SHAPE, 9.0))
+    for name, value in numbers.items():
+        window = window._replace(**{name: getattr(window, name).at[at].set(value)})
+    return window._replace(
+        mean=window.mean.astype(jnp.float32).at[at].set(mean),
+        axes=window.axes.astype(jnp.float32).at[at].set(axes),
+    )
+
+
+def random_window(seed, share):
+    """Patches in a share of the voxels, of all sizes, places and directions, most of them sure."""
+    rng = np.random.default_rng(seed)
+    cells = np.argwhere(rng.random(SHAPE) < share)
+    turns = Rotation.random(len(cells), random_state=seed).as_matrix()
+    deviations = np.sort(rng.uniform(0.01, 0.4, (len(cells), 3)), axis=1)[:, ::-1]
+    hits = rng.uniform(2, 30, len(cells))
+    return window_of(
+        cells,
+        rng.uniform(-0.5, 0.5, (len(cells), 3)),
+        deviations[:, :, None] * turns,
+        hits,
+        hits * rng.uniform(0.5, 2, len(cells)),
+        rng.uniform(0, 60, len(cells)),
+    )
+
+
+def surfaces(window):
+    return np.asarray(doubles.is_surface(CONFIG, window))
+
+
+def slow_lies_on(window, other, counts):
+    """Voxel by voxel: the patches of a window on surer patches of the other one that count."""
+    found = np.zeros(SHAPE, bool)
+    mean, axes = (np.asarray(x, float) for x in (window.mean, window.axes))
+    other_mean, other_axes = (np.asarray(x, float) for x in (other.mean, other.axes))
+    for cell in np.argwhere(np.asarray(window.hits) > 0):
+        for near in np.argwhere(counts):
+            if np.abs(near - cell).max() > 1 or other.weight[*near] <= window.weight[*cell]:
+                continue
+            apart = cell + mean[*cell] - near - other_mean[*near]
+            for axis in other_axes[*near][:2]:
+                half = 0.9 * 3**0.5 * axis
+                apart = apart - np.clip(apart @ half / (half @ half), -1, 1) * half
+            facing = axes[*cell][2] @ other_axes[*near][2] > 0
+            found[*cell] |= bool(np.linalg.norm(apart) < 0.7 and facing)
+    return found
+
+
+def test_dropped_patches_are_those_of_loops_and_lie_on_a_patch_that_stays():
+    pair = random_window(0, 0.2), random_window(1, 0.2)
+    sure = [(w.hits >= 10) & (w.hits >= 0.5 * (w.hits + jnp.abs(w.passes))) for w in pair]
+    surface = [surfaces(window) for window in pair]
+    after = drop_doubles(CONFIG, *pair)
+    lost = [
+        np.asarray((old.hits > 0) & (new.hits == 0)) for old, new in zip(pair, after, strict=True)
+    ]
+    for own, (k, j) in enumerate([(0, 1), (1, 0)]):
+        first = slow_lies_on(pair[k], pair[j], surface[j]) & ~surface[j] & ~np.asarray(sure[k])
+        back = slow_lies_on(pair[j], pair[k], surface[k]) & ~surface[k] & ~np.asarray(sure[j])
+        expected = first & slow_lies_on(pair[k], pair[j], surface[j] & ~back)
+        np.testing.assert_array_equal(lost[own], expected)
+        assert expected.sum() > 5
+        assert not (lost[own] & ~slow_lies_on(pair[k], pair[j], surface[j] & ~lost[j])).any()
+        for name in NAMES:
+            old, new = (np.asarray(getattr(w, name))[~lost[own]] for w in (pair[k], after[k]))
+            np.testing.assert_array_equal(new, old, err_msg=name)
+
+
+def flat(normal=(0.0, 0.0, 1.0)):
+    """Axes of a disk that fills its voxel."""
+    turn, _ = Rotation.align_vectors([normal], [(0, 0, 1)])
+    return np.diag([0.3, 0.3, 0.02]) @ turn.as_matrix().T
+
+
+@pytest.mark.parametrize(
+    ("change", "stays"),
+    [
+        ({}, False),
+        ({"mean": (0, 0, -0.4)}, True),  # 0.9 voxels before the other patch
+        ({"axes": flat((0, 0, -1))}, True),  # seen from the other side
+        ({"hits": 12.0, "passes": 3.0, "weight": 1.0}, True),  # sure
+        ({"weight": 90.0}, True),  # surer than the other
+    ],
+)
+def test_what_lies_on_a_surer_patch_of_its_side_is_dropped_and_nothing_else(change, stays):
+    wall = window_of([(5, 5, 4)], (0, 0, -0.5), flat(), hits=40.0)
+    thin = window_of([(5, 5, 3)], **({"mean": (0, 0, 0.3), "axes": flat(), "hits": 3.0} | change))
+    for order in ((wall, thin), (thin, wall)):
+        after = drop_doubles(CONFIG, *order)
+        kept = after[0] if order[0] is thin else after[1]
+        assert bool(kept.hits[5, 5, 3] > 0) == stays
+        assert float(kept.passes[5, 5, 3]) > 0  # observed, in any case
+        assert sum(float(window.hits[5, 5, 4]) for window in after) == 40
+
+
+def test_a_surface_of_both_maps_in_one_voxel_is_no_double():
+    """There the moments add up."""
+    pair = [window_of([(5, 5, 4)], (0, 0, z), flat(), hits=h) for z, h in ((-0.4, 40), (0.1, 4))]
+    for window, after in zip(pair, drop_doubles(CONFIG, *pair), strict=True):
+        np.testing.assert_array_equal(after.hits, window.hits)
+
+
+def moved(window, coincides):
+    return adding.Moved(jnp.asarray(coincides), lambda offset: jnp.abs(window.passes))
+
+
+def test_maps_whose_voxels_coincide_keep_all_their_hits():
+    pair = [random_window(seed, 0.1)._replace(passes=jnp.ones(SHAPE)) for seed in (2, 3)]
+    hits = sum(float(window.hits.sum()) for window in pair)
+
+    def total(coincides):
+        moves = [None, moved(pair[1], coincides)]
+        return float(adding.sum_evidence(CONFIG, pair, moves).hits.sum())
+
+    assert total(True) == pytest.approx(hits, rel=1e-5)
+    assert total(False) < 0.995 * hits
+
+
+def test_rays_of_a_moved_map_carve_stray_hits_where_its_voxels_overlap_unseen_ones():
+    stray = window_of([(5, 5, 3)], (0, 0, 0.2), np.diag([0.1, 0.05, 0.01]), hits=2.0)
+    wall = window_of([(5, 5, 5)], (0, 0, -0.4), flat(), hits=50.0)
+    wall = wall._replace(passes=wall.passes.at[5, 5, 3].set(0))  # rebinning took them
+
+    def is_there(passed):
+        through = adding.Moved(jnp.asarray(False), lambda offset: jnp.full(SHAPE, passed))
+        total = adding.sum_evidence(CONFIG, [stray, wall], [None, through])
+        return bool(patches.is_feature(CONFIG, total.hits, total.passes, total.axes)[5, 5, 3])
+
+    assert is_there(3.0)
+    assert not is_there(100.0)
