@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.mapping.registration.matching import match_points
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move
+from hiosdf_jax._src.numerics.small_matrices import solve_positive
 from hiosdf_jax._src.state import Baked, Field
 
 INLIER_DEVIATIONS = 3.0
@@ -308,7 +309,7 @@ def find_step(
     matrix = stiffness(information, directions, anchor)
     wanted = balance(directions, slope_of(residuals) / inflation, anchor, rows, pose)
     size = _sizes(matrix)
-    step = size * jnp.linalg.solve(size[:, None] * matrix * size, size * wanted)
+    step = size * solve_positive(size[:, None] * matrix * size, size * wanted)
     return -jnp.matmul(directions.basis, step, precision="highest") / units(rows)
 
 

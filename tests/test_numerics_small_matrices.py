@@ -1,0 +1,45 @@
+"""Small linear equations against numpy in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hiosdf_jax._src.numerics.small_matrices import solve_positive
+
+solve = jax.jit(solve_positive)
+
+
+def positive(seed, count, size, condition):
+    """Symmetric matrices with eigenvalues from 1 to 1 / condition."""
+    rng = np.random.default_rng(seed)
+    basis = np.linalg.qr(rng.normal(size=(count, size, size)))[0]
+    values = np.geomspace(1, 1 / condition, size)
+    return basis @ (values[:, None] * np.swapaxes(basis, 1, 2)), rng.normal(size=(count, size))
+
+
+@pytest.mark.parametrize(("size", "condition"), [(1, 1), (3, 10), (6, 10), (6, 1000)])
+def test_solutions_are_those_of_numpy(size, condition):
+    matrix, value = positive(size, 300, size, condition)
+    matrix, value = matrix.astype(np.float32), value.astype(np.float32)
+    expected = np.linalg.solve(matrix.astype(float), value.astype(float)[..., None])[..., 0]
+    found = np.asarray(solve(matrix, value))
+    error = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    assert error.max() < 2e-6 * condition
+    one = np.stack([solve(m, v) for m, v in zip(matrix[:5], value[:5], strict=True)])
+    np.testing.assert_allclose(one, found[:5], rtol=1e-5 * condition, atol=1e-5)
+
+
+def test_a_direction_without_information_stays_finite():
+    matrix = np.diag([1.0, 2.0, 1e-30]).astype(np.float32)
+    found = np.asarray(solve(matrix, np.array([1.0, 1.0, 0.0], np.float32)))
+    np.testing.assert_allclose(found, [1.0, 0.5, 0.0])
+
+
+def test_the_derivative_is_that_of_the_inverse():
+    (matrix,), (value,) = (part.astype(np.float32) for part in positive(9, 1, 6, 5))
+    by_value = jax.jacfwd(solve_positive, argnums=1)(matrix, value)
+    np.testing.assert_allclose(by_value, np.linalg.inv(matrix.astype(float)), atol=1e-4)
+    turned = jax.grad(lambda v: jnp.sum(solve_positive(matrix, v) ** 2))(value)
+    exact = 2 * np.linalg.solve(matrix.T, np.linalg.solve(matrix, value))
+    np.testing.assert_allclose(turned, exact, rtol=1e-3)
