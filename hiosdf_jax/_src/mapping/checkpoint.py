@@ -83,7 +83,7 @@ def save_with_progress(
         OSError: As for `save`.
     """
     if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"path is {path!r}, expected the name of a file")
+        raise ValueError(f"path is a {type(path).__name__}, expected the name of a file")
     check_map(state)
     if is_traced(*jax.tree.leaves(state)):
         raise ValueError("state is traced, expected a map: call save outside jit")
