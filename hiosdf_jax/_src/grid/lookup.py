@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
+from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.vectors import (
     Vector,
     cross,
@@ -240,6 +241,7 @@ def _patches_at(
 ) -> _Patches:
     """Computes distances of points from the patches that the voxels around them know."""
     jump = take(surface.derived.nearest.reshape(-1, 3), corners.flat)
+    corners, jump = compute_once((corners, jump))
     found = corners.inside & (jump[0] != NO_FEATURE)
     # Relative to one voxel's center, so that large coordinates lose no digits.
     first = each(lambda i: i[0], corners.index)
@@ -247,6 +249,7 @@ def _patches_at(
     point = split((points_world - first_world) / config.voxel_size)
     sites = each(lambda i, j: jnp.where(found, i + j, 0), corners.index, jump)
     row = geometry.flat_index(config.grid_shape, sites)
+    found, sites, row = compute_once((found, sites, row))
     means, axes = surface.mean.reshape(-1, 3), surface.axes.reshape(-1, 9)
     mean = each(lambda m, s, f: m + (s - f), take(means, row), sites, first)
     fixed = jax.lax.stop_gradient(point)

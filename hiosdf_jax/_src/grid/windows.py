@@ -12,6 +12,7 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
+from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.modes import cond
 
 # A cloud that fills less than this share of the range in each direction, such as that of a camera
@@ -123,5 +124,5 @@ def recompute[T](
     """
     small, large, fits = place_windows(config, box, horizon_m)
     if (small.shape, small.inner_shape) == (large.shape, large.inner_shape):
-        return function(large)
+        return compute_once(function(large))
     return cond(fits, lambda: function(small), lambda: function(large))
