@@ -103,7 +103,7 @@ def test_each_group_has_samples_of_all_depths():
 @pytest.mark.parametrize("tile", [1024, 16])
 @pytest.mark.parametrize("every", [1, 2, 4])
 def test_each_slope_counts_once_in_every_few_epochs(monkeypatch, every, tile):
-    monkeypatch.setattr(tiles, "_ROWS", tile)
+    monkeypatch.setattr(tiles, "LARGEST", tile)
     train = compiled_train()
     config = dataclasses.replace(TINY, eikonal_every=every, eikonal_weight=0.3, learning_rate=0.02)
     network, samples = training.init_network(config, jax.random.key(0)), some_samples(64)
@@ -160,7 +160,7 @@ def test_a_step_in_tiles_equals_a_step(monkeypatch, every):
     config = dataclasses.replace(TINY, eikonal_every=every)
     network, samples = training.init_network(config, jax.random.key(0)), some_samples(70)
     whole, *_ = train(config, network, samples, 1)
-    monkeypatch.setattr(tiles, "_ROWS", 16)
+    monkeypatch.setattr(tiles, "LARGEST", 16)
     batch = jax.tree.map(
         lambda array: array[0], training._split(config, samples, jax.random.key(0))
     )

@@ -14,6 +14,7 @@ from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.numerics.modes import pointwise
+from hiosdf_jax._src.numerics.rows import Evaluate, by_rows
 from hiosdf_jax._src.state import (
     Baked,
     Bound,
@@ -161,12 +162,7 @@ _compiled = functools.partial(jax.jit, static_argnames=("unknown", "bound"))
 @functools.partial(jax.jit, static_argnames="unknown")
 @pointwise
 def _query(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
-    points = _clipped(points)
-    place = _place(field, points)
-    frontier = _frontier(field, place)
-    sdf, grad = _with_gradient(field, points, unknown, "sdf")
-    lower, lower_grad = _with_gradient(field, points, "network", "lower")
-    return Query(sdf, grad, frontier > 0, frontier, lower, lower_grad)
+    return _queries(unknown)(field, _clipped(points))
 
 
 @_compiled
@@ -174,13 +170,37 @@ def _query(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
 def _distance_and_grad(
     field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound
 ) -> tuple[jax.Array, jax.Array]:
-    return _with_gradient(field, _clipped(points), unknown, bound)
+    return _gradients(unknown, bound)(field, _clipped(points))
 
 
 @_compiled
 @pointwise
 def _distance(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound) -> jax.Array:
-    return _value(field, _clipped(points), unknown, bound)
+    return _values(unknown, bound)(field, _clipped(points))
+
+
+@functools.cache
+def _values(unknown: Unknown, bound: Bound) -> Evaluate:
+    return by_rows(
+        functools.partial(_value, unknown=unknown, bound=bound), _gradients(unknown, bound)
+    )
+
+
+@functools.cache
+def _gradients(unknown: Unknown, bound: Bound) -> Evaluate:
+    return by_rows(functools.partial(_with_gradient, unknown=unknown, bound=bound))
+
+
+@functools.cache
+def _queries(unknown: Unknown) -> Evaluate:
+    return by_rows(functools.partial(_all_answers, unknown=unknown))
+
+
+def _all_answers(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
+    frontier = _frontier(field, _place(field, points))
+    sdf, grad = _with_gradient(field, points, unknown, "sdf")
+    lower, lower_grad = _with_gradient(field, points, "network", "lower")
+    return Query(sdf, grad, frontier > 0, frontier, lower, lower_grad)
 
 
 def _with_gradient(

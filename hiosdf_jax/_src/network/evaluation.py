@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from hiosdf_jax._src.network import forward, tiles
+from hiosdf_jax._src.network import forward
+from hiosdf_jax._src.network.tiles import LARGEST
+from hiosdf_jax._src.numerics.tiles import map_tiles
 
 _HOPPER = "9.0"  # CUDA's compute capability
 _WIDTHS = (128, 256)
@@ -76,11 +78,13 @@ def _has_kernel(params: Any) -> bool:
 
 
 def _value_by_xla(frequency: Any, params: Any, points: jax.Array) -> jax.Array:
-    return tiles.map_tiles(lambda rows: forward.value(frequency, params, rows), points)
+    return map_tiles(lambda rows: forward.value(frequency, params, rows), points, LARGEST)
 
 
 def _value_and_gradient_by_xla(frequency: Any, params: Any, points: jax.Array) -> Any:
-    return tiles.map_tiles(lambda rows: forward.value_and_gradient(frequency, params, rows), points)
+    return map_tiles(
+        lambda rows: forward.value_and_gradient(frequency, params, rows), points, LARGEST
+    )
 
 
 def _choose_value(frequency: jax.Array, params: Any, points: jax.Array) -> jax.Array:

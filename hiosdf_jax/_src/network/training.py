@@ -14,6 +14,7 @@ import optax
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.network import forward, siren, tiles
 from hiosdf_jax._src.numerics.modes import varying_like
+from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.samples.draw import Samples
 from hiosdf_jax._src.state import Network
 
@@ -167,7 +168,7 @@ def train(
     )
     points = samples.points_world - network.origin_world
     # By XLA: a kernel for one evaluation per update would take longer to compile than it saves.
-    value = tiles.map_tiles(partial(forward.value, config.frequency, mean), points)
+    value = map_tiles(partial(forward.value, config.frequency, mean), points, tiles.LARGEST)
     residual = value - samples.sdf
     mean = siren.shift_output(config, mean, -_median(residual, samples.weight))
     trained = network.replace(params=params, average=mean, optimizer=state)

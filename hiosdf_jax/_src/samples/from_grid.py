@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -10,6 +12,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.numerics.modes import cond
+from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.samples.draw import Samples, draw_from_mask
 from hiosdf_jax._src.state import NO_FEATURE, Grid, surface_of
@@ -19,6 +22,8 @@ from hiosdf_jax._src.state import NO_FEATURE, Grid, surface_of
 _PER_CHANGED_VOXEL = 10
 _MOST_CHANGED_SHARE = 0.25
 _CHANGED_SPREAD_M = 0.35
+
+_TILE = 4096  # points whose distances are computed at once on a CPU
 
 
 def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
@@ -55,7 +60,8 @@ def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
     place = jax.random.uniform(place_key, index.shape, jnp.float32, minval=-0.5, maxval=0.5)
     points_world = geometry.voxel_center(config, index) + place * config.voxel_size
     points_world = _move_to_changes(config, evidence.change, known, points_world, change_key)
-    return Samples(points_world, lookup.grid_sdf(config, surface_of(grid), points_world), weight)
+    grid_sdf = partial(lookup.grid_sdf, config, surface_of(grid))
+    return Samples(points_world, map_tiles(grid_sdf, points_world, _TILE), weight)
 
 
 def _move_to_changes(
