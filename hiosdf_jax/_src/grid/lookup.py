@@ -101,7 +101,7 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     value = jnp.where(any_sided, signed, distance)
 
     # It cancels from the mean, and so does its derivative.
-    least = jax.lax.stop_gradient(jnp.min(jnp.where(found, distance, jnp.inf), axis=0))
+    least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)
     # Not by a minimum: at the nearest patch it would halve the derivative.
     nearness = jnp.exp(jnp.where(found, least - distance, 0) / _SOFT_VOXELS)
     weight = jnp.where(counts, jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness, 0)
