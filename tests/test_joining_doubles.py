@@ -1,4 +1,6 @@
-"""Patches that lie on a surer patch of another map, against float64; what is never dropped."""
+"""Patches that lie on a sure patch of another map, against float64; what is never dropped."""
+
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from voxels import CONFIG, SHAPE, empty_window
 
-from hiosdf_jax._src.grid import patches
+from hiosdf_jax._src.grid import distance, patches
 from hiosdf_jax._src.mapping.joining import adding, doubles
 
 drop_doubles = jax.jit(doubles.drop_doubles, static_argnums=0)
@@ -67,7 +69,7 @@ def slow_lies_on(window, other, counts):
 
 
 def test_dropped_patches_are_those_of_loops_and_lie_on_a_patch_that_stays():
-    pair = random_window(0, 0.2), random_window(1, 0.2)
+    pair = random_window(0, 0.3), random_window(1, 0.3)
     sure = [(w.hits >= 10) & (w.hits >= 0.5 * (w.hits + jnp.abs(w.passes))) for w in pair]
     surface = [surfaces(window) for window in pair]
     after = drop_doubles(CONFIG, *pair)
@@ -75,9 +77,8 @@ def test_dropped_patches_are_those_of_loops_and_lie_on_a_patch_that_stays():
         np.asarray((old.hits > 0) & (new.hits == 0)) for old, new in zip(pair, after, strict=True)
     ]
     for own, (k, j) in enumerate([(0, 1), (1, 0)]):
-        first = slow_lies_on(pair[k], pair[j], surface[j]) & ~surface[j] & ~np.asarray(sure[k])
-        back = slow_lies_on(pair[j], pair[k], surface[k]) & ~surface[k] & ~np.asarray(sure[j])
-        expected = first & slow_lies_on(pair[k], pair[j], surface[j] & ~back)
+        on_sure = slow_lies_on(pair[k], pair[j], surface[j] & np.asarray(sure[j]))
+        expected = on_sure & ~surface[j] & ~np.asarray(sure[k])
         np.testing.assert_array_equal(lost[own], expected)
         assert expected.sum() > 5
         assert not (lost[own] & ~slow_lies_on(pair[k], pair[j], surface[j] & ~lost[j])).any()
@@ -110,7 +111,42 @@ def test_what_lies_on_a_surer_patch_of_its_side_is_dropped_and_nothing_else(chan
         kept = after[0] if order[0] is thin else after[1]
         assert bool(kept.hits[5, 5, 3] > 0) == stays
         assert float(kept.passes[5, 5, 3]) > 0  # observed, in any case
+        assert not stays or kept.behind[5, 5, 3] == thin.behind[5, 5, 3]
         assert sum(float(window.hits[5, 5, 4]) for window in after) == 40
+
+
+def test_a_dropped_patch_leaves_no_free_voxel_where_no_ray_passed():
+    wall = window_of([(5, 5, 4)], (0, 0, -0.5), flat(), hits=40.0)
+    thin = window_of([(5, 5, 3)], (0, 0, 0.3), flat(), hits=3.0, passes=0.0)
+    after = drop_doubles(CONFIG, wall, thin)[1]
+    assert after.hits[5, 5, 3] == 0 and after.passes[5, 5, 3] > 0
+    assert not distance.is_free(after.passes, after.behind)[5, 5, 3]
+
+
+def test_what_a_patch_was_dropped_for_stays_in_the_sum():
+    """Its own map may have looked through the place of the surer patch many times."""
+    thin = window_of([(5, 5, 3)], (0, 0, 0.3), flat(), hits=8.0, passes=2.0)
+    thin = thin._replace(passes=thin.passes.at[5, 5, 4].set(60.0))
+    for hits in (8.5, 12.0, 40.0):  # too few hits to be sure, and more
+        wall = window_of([(5, 5, 4)], (0, 0, -0.5), flat(), hits=hits, passes=hits)
+        for pair in ((thin, wall), (wall, thin)):
+            total = adding.sum_evidence(CONFIG, pair, [None, moved(pair[1], False)])
+            assert surfaces(total)[5, 5, 3:5].any()
+
+
+def test_a_chain_of_patches_keeps_one_within_reach_of_each():
+    """P lies on Q of a second map, and Q on R of a third one; R is far from P."""
+    p = window_of([(5, 5, 2)], (0, 0, 0.45), flat(), hits=4.0)
+    q = window_of([(5, 5, 3)], (0, 0, 0.1), flat(), hits=8.0)
+    r = window_of([(5, 5, 4)], (0, 0, -0.3), flat(), hits=40.0)
+    few = [w._replace(passes=jnp.minimum(w.passes, 1)) for w in (p, q, r)]
+    for order in itertools.permutations(few):
+        moves = [None, *(moved(window, False) for window in order[1:])]
+        total = adding.sum_evidence(CONFIG, order, moves)
+        there = np.argwhere(surfaces(total))
+        heights = [cell[2] + float(total.mean[*cell][2]) for cell in there]
+        for height in (2.45, 3.1, 3.7):
+            assert min(abs(height - h) for h in heights) < 0.75
 
 
 def test_a_surface_of_both_maps_in_one_voxel_is_no_double():

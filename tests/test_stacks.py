@@ -215,6 +215,9 @@ def test_strict_promotion(fields, kind, empty_map):
         jax.eval_shape(everything, fields[kind], POINTS)
         jax.eval_shape(jax.grad(lambda points: obstacle(fields[kind], points).sum()), POINTS)
         planning.sphere_clearance(fields[kind], POINTS[None], RADII)
+        for one in (hio.query, jax.grad(hio.sdf, 1), jax.jacfwd(jax.grad(obstacle, 1), 1)):
+            jax.eval_shape(jax.vmap(one, (None, 0)), fields[kind], POINTS)
+            jax.eval_shape(jax.vmap(one), jax.tree.map(lambda x: x[None], fields[kind]), POINTS[:1])
         if kind == "map":
             jax.eval_shape(lambda field: hio.bake(field, 0.1), fields[kind])
             jax.eval_shape(updated, empty_map, cloud, pose)

@@ -15,6 +15,7 @@ from jax.custom_batching import custom_vmap
 
 from hiosdf_jax._src.network import forward
 from hiosdf_jax._src.network.tiles import LARGEST
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.tiles import map_tiles
 
 _HOPPER = "9.0"  # CUDA's compute capability
@@ -113,6 +114,7 @@ def _batching(function: Any, by_xla: Any) -> Any:
     """Takes a batch of points as more rows; several networks at once are left to XLA."""
     wrapped = custom_vmap(function)
 
+    @plain  # traced again when a caller batches it, in the caller's modes
     def of_batch(size: int, batched: Any, *arguments: Any) -> Any:
         if any(jax.tree.leaves(batched[:2])):
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))

@@ -1,7 +1,8 @@
 """Functions of many points, evaluated tile by tile however a caller batches them.
 
 `jax.vmap` over points makes more rows of one evaluation. So a planner that is written for one point
-is as fast as one that is written for a batch, and needs no more memory.
+is as fast as one that is written for a batch, and needs no more memory. Several fields, derivatives
+by the field and second derivatives are evaluated as a whole.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ def by_rows(function: Evaluate, with_gradient: Evaluate | None = None) -> Evalua
     )
 
     @tiled.def_vmap
+    @plain  # traced again when a caller batches it, in the caller's modes
     def of_batch(size: int, batched: Any, field: Any, points: jax.Array) -> Any:
         if any(jax.tree.leaves(batched[0])):  # several fields
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))

@@ -9,8 +9,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-# Pivots below this share of the diagonal are rounding errors.
-_LEAST_PIVOT = 1e-12
+# Pivots below this share of the diagonal are rounding errors of float32.
+_LEAST_PIVOT = 1e-5
 
 
 def solve_positive(matrix: jax.Array, value: jax.Array) -> jax.Array:

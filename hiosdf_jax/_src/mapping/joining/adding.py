@@ -16,10 +16,6 @@ from hiosdf_jax._src.mapping.joining.doubles import drop_doubles, is_sure, is_su
 from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 
-# Surfaces of two maps are one if they are at most this many voxels apart, where the voxels of the
-# maps do not coincide; otherwise, if they are neighbors.
-_BESIDE_MOVED_VOXELS = 2
-
 
 class Moved(NamedTuple):
     """How the map of a window lies in the voxels of the sum.
@@ -51,12 +47,12 @@ def sum_evidence(
         Their sum, limited to `Config.evidence_limit` and not rounded.
     """
     moved = [*moved, *[None] * (len(windows) - len(moved))]
-    kept = _only_in_one(config, windows, _BESIDE_MOVED_VOXELS if any(moved) else 1)
+    apart = sum(map(_is_apart, moved), start=jnp.asarray(False))
+    kept = _only_in_one(config, windows, apart)
     total = windows[0]
-    apart = _is_apart(moved[0])
-    for window, its_move in zip(windows[1:], moved[1:], strict=True):
+    for window in windows[1:]:
         if any(moved):
-            apart |= _is_apart(its_move)
+            kept |= is_surface(config, total) & is_sure(total)  # doubles of it are dropped
             total, window = cond(
                 apart, partial(drop_doubles, config), lambda *both: both, total, window
             )
@@ -89,8 +85,10 @@ def _count_passes(
     return total._replace(passes=jnp.where(total.hits > 0, most, total.passes))
 
 
-def _only_in_one(config: Config, windows: Sequence[EvidenceWindow], reach_voxels: int) -> jax.Array:
-    """Finds surfaces of one of the windows that none of the others has within some voxels.
+def _only_in_one(config: Config, windows: Sequence[EvidenceWindow], apart: jax.Array) -> jax.Array:
+    """Finds surfaces of one of the windows that none of the others has beside them.
+
+    Beside are neighboring voxels, and within two voxels where the maps' voxels are apart.
 
     Beside surfaces of others, noise and edges leave a few hits in voxels that most rays pass. There
     the sum decides, as in one map: 1.07 instead of 0.53 cm for a house in two halves otherwise.
@@ -99,9 +97,8 @@ def _only_in_one(config: Config, windows: Sequence[EvidenceWindow], reach_voxels
     found, beside, several = (jnp.zeros(shape, bool) for _ in range(3))
     surfaces = [is_surface(config, window) for window in windows]
     for surface in surfaces:
-        near = surface
-        for _ in range(reach_voxels):
-            near = with_neighbors(near)
+        near = with_neighbors(surface)
+        near |= apart & with_neighbors(near)
         beside, several = beside | near, several | (beside & near)
     for window, surface in zip(windows, surfaces, strict=True):
         # A surface is beside itself.

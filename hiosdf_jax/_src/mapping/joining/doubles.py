@@ -1,4 +1,4 @@
-"""One surface in two grids: patches that lie on a surer patch of the other grid.
+"""One surface in two grids: patches that lie on a sure patch of the other grid.
 
 Where the voxels of two maps do not coincide, their patches of one wall may lie in different voxels.
 Both together would be a thicker wall. In one map, the hits of both would have shared a voxel.
@@ -22,7 +22,8 @@ _SURE_RATIO = 0.5
 # The center of a double is at most this far from the other patch, voxels.
 _MOST_VOXELS = 0.7
 
-# A voxel whose patch is dropped counts this many passes: it is seen, and not free.
+# A voxel whose patch is dropped counts this many passes: it is seen. Its hits count as rays that
+# ended before it: they did not show it to be free.
 _SEEN = 2.0**-8
 
 
@@ -41,11 +42,10 @@ def is_sure(window: EvidenceWindow) -> jax.Array:
 def drop_doubles(
     config: Config, first: EvidenceWindow, second: EvidenceWindow
 ) -> tuple[EvidenceWindow, EvidenceWindow]:
-    """Drops the patches that lie on a surer patch of the other window in a neighboring voxel.
+    """Drops the patches that lie on a sure patch of the other window in a neighboring voxel.
 
-    Surer is the patch with more weight. Both must face the same side. The surer patch is never
-    dropped itself: a surface stays within 0.7 voxels of the center of each dropped patch. Patches
-    of many hits that few rays pass are never dropped.
+    The sure patch must face the same side and have more weight. It is never dropped itself. If the
+    caller keeps it, a surface stays within 0.7 voxels of the center of each dropped patch.
 
     Args:
         config: The map's configuration.
@@ -56,16 +56,14 @@ def drop_doubles(
         Both windows, without the hits of these patches. Their voxels stay observed.
     """
     in_first, in_second = is_surface(config, first), is_surface(config, second)
-    here = _lies_on(first, second, in_second) & ~in_second & ~is_sure(first)
-    there = _lies_on(second, first, in_first) & ~in_first & ~is_sure(second)
-    # Again, on the patches that stay.
-    dropped = here & _lies_on(first, second, in_second & ~there)
-    there &= _lies_on(second, first, in_first & ~here)
-    return _without(first, dropped), _without(second, there)
+    sure_first, sure_second = is_sure(first), is_sure(second)
+    here = _lies_on(first, second, in_second & sure_second) & ~in_second & ~sure_first
+    there = _lies_on(second, first, in_first & sure_first) & ~in_first & ~sure_second
+    return _without(first, here), _without(second, there)
 
 
 def _lies_on(window: EvidenceWindow, other: EvidenceWindow, surface: jax.Array) -> jax.Array:
-    """Returns a mask of the patches of a window that lie on surer ones of the other, (X, Y, Z).
+    """Returns a mask of the patches of a window that lie on weightier ones of the other, (X, Y, Z).
 
     Args:
         window: Evidence.
@@ -110,6 +108,7 @@ def _without(window: EvidenceWindow, dropped: jax.Array) -> EvidenceWindow:
     return window._replace(
         hits=clear(window.hits),
         passes=jnp.where(dropped & (window.passes == 0), _SEEN, window.passes),
+        behind=jnp.where(dropped, window.behind + jnp.maximum(window.hits, 1), window.behind),
         weight=clear(window.weight),
         mean=clear(window.mean),
         axes=clear(window.axes),
