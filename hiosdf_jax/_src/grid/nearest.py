@@ -20,8 +20,9 @@ from hiosdf_jax._src.numerics.shifts import pad_axis
 _INFINITE = 1e12  # squared voxels
 
 # A CPU transforms blocks of about this many voxels one after the other, so that they stay in its
-# cache: 0.7 of the time. A GPU transforms all voxels at once.
-_BLOCK = 100_000
+# cache. Blocks of 100,000 take 1.16 times as long, blocks of 6,000 1.26 times. A GPU transforms all
+# voxels at once.
+_BLOCK = 12_000
 
 # A GPU takes this many shifts in either direction per step of the loop, to start fewer kernels. A
 # CPU takes one, which compiles faster and runs as fast.
