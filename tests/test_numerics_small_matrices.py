@@ -30,6 +30,12 @@ def test_solutions_are_those_of_numpy(size, condition):
     np.testing.assert_allclose(one, found[:5], rtol=1e-5 * condition, atol=1e-5)
 
 
+def test_a_direction_without_information_stays_finite():
+    matrix = np.diag([1.0, 2.0, 1e-30]).astype(np.float32)
+    found = np.asarray(solve(matrix, np.array([1.0, 1.0, 0.0], np.float32)))
+    np.testing.assert_allclose(found, [1.0, 0.5, 0.0])
+
+
 def test_directions_without_information_stay_finite():
     """Two returns give a matrix of rank 2, up to rounding; what they say nothing about stays."""
     rng = np.random.default_rng(4)

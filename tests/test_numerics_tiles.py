@@ -22,7 +22,8 @@ def test_tiles_do_not_change_the_result(rows):
     assert max(sizes) <= 16
 
 
-def test_tiles_keep_the_axes_of_points():
+@pytest.mark.parametrize("rows", [0, 1, 16, 17, 50])
+def test_tiles_keep_the_axes_of_points(rows):
     assert map_tiles(lambda rows: rows[..., 0], jnp.ones(3), 16).shape == ()
-    points = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    points = np.random.default_rng(0).normal(size=(rows, 7, 3)).astype(np.float32)
     np.testing.assert_array_equal(map_tiles(lambda rows: rows, jnp.asarray(points), 16), points)
