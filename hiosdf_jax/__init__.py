@@ -15,8 +15,9 @@ from hiosdf_jax._src.mapping.background.mapper import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.joining.merging import correct, merge, transform
+from hiosdf_jax._src.mapping.lifecycle import grow, init, snapshot
 from hiosdf_jax._src.mapping.moving import moving_rows
-from hiosdf_jax._src.mapping.pipeline import grow, init, pad_cloud, snapshot, update
+from hiosdf_jax._src.mapping.pipeline import pad_cloud, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
 from hiosdf_jax._src.mapping.tracking import predict_pose, track

@@ -11,7 +11,7 @@ from poses import random_pose, timed
 from scipy.spatial.transform import Rotation
 
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
-from hiosdf_jax._src.numerics.posed_cloud import check_pose
+from hiosdf_jax._src.numerics.intake import check_pose
 
 SEEDS = st.integers(0, 2**31)
 

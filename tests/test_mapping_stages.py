@@ -8,7 +8,7 @@ from room import stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.stages import CHECKS, FUSION, STAGES, begin, is_accepted, refuse
-from hiosdf_jax._src.numerics.posed_cloud import check_extras
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 
 
 @pytest.fixture(scope="module")

@@ -91,6 +91,6 @@ def test_snapshot_is_independent_of_a_donated_map(empty_map):
 def test_a_cloud_without_rows_is_flagged_inside_jit(room_map):
     # What a user's jit traces, run operation by operation: to compile a whole update takes longer.
     with jax.disable_jit():
-        after = pipeline.trace_update(room_map, jnp.zeros((0, 3)), jnp.eye(4))
+        after = pipeline._update(room_map, jnp.zeros((0, 3)), jnp.eye(4), None, None, np.uint32(0))
     assert int(after.report.flags) & hio.Flag.EMPTY_CLOUD
     assert arrays_equal(after.grid, room_map.grid)

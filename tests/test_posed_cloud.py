@@ -11,14 +11,8 @@ from poses import random_pose
 from room import CONFIG
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.numerics.posed_cloud import (
-    as_traced,
-    check_pose,
-    finite_rows,
-    prepare,
-    warn_out_of_range,
-    warn_outside,
-)
+from hiosdf_jax._src.mapping.pipeline import prepare, warn_out_of_range, warn_outside
+from hiosdf_jax._src.numerics.intake import as_traced, check_pose, cloud_and_returns
 
 SEEDS = st.integers(0, 2**31)
 
@@ -75,7 +69,8 @@ def test_the_source_of_a_pose_is_optional():
 def test_rows_with_nan_or_inf_are_no_returns():
     cloud = np.arange(12.0).reshape(4, 3)
     cloud[1, 2], cloud[2, 0] = np.nan, -np.inf
-    assert finite_rows(cloud).tolist() == [True, False, False, True]
+    _, finite = cloud_and_returns(cloud)
+    assert finite.tolist() == [True, False, False, True]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +84,7 @@ def test_rows_with_nan_or_inf_are_no_returns():
 )
 def test_clouds_without_returns_are_refused(cloud, message):
     with pytest.raises(ValueError, match=message):
-        finite_rows(cloud)
+        cloud_and_returns(cloud)
 
 
 def test_shapes_are_checked_without_values():

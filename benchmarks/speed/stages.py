@@ -17,8 +17,8 @@ from benchmarks.speed.setup import Frame
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import evidence, geometry, patches
 from hiosdf_jax._src.grid.windows import RayBox, Window, box_of_rays, place_windows
+from hiosdf_jax._src.mapping import pipeline
 from hiosdf_jax._src.mapping.stages import STAGES, Step, begin
-from hiosdf_jax._src.numerics import posed_cloud
 from hiosdf_jax._src.state import Evidence, MapState
 
 _COMPARE = {
@@ -53,7 +53,7 @@ def take_apart(state: MapState, frame: Frame) -> dict[str, Part]:
     Returns:
         The stages by name, in order.
     """
-    cloud, pose = map(jnp.asarray, posed_cloud.prepare(*frame, state.config.max_points))
+    cloud, pose = map(jnp.asarray, pipeline.prepare(*frame, state.config.max_points))
     step = jax.jit(begin)(state, cloud, jnp.all(jnp.isfinite(cloud), axis=-1), pose)
     parts = {}
     for stage in STAGES:

@@ -15,7 +15,6 @@ from benchmarks.speed.processes import resident_mb
 from benchmarks.speed.rows import Baseline, Measured, Row, single, spread_of, time_ms
 from benchmarks.speed.setup import Setup
 from hiosdf_jax._src.mapping import pipeline
-from hiosdf_jax._src.numerics import posed_cloud
 from hiosdf_jax._src.state import MapState
 
 _TURNS = 5
@@ -58,7 +57,7 @@ def whole_updates(setup: Setup, label: str, mapped: Mapped) -> Measured:
     """
     state = mapped.state
     cloud, pose = setup.frame(int(state.updates))
-    prepared = jax.device_put(posed_cloud.prepare(cloud, pose, state.config.max_points))
+    prepared = jax.device_put(pipeline.prepare(cloud, pose, state.config.max_points))
     alone = time_ms(
         pipeline._update_jit,
         state,

@@ -13,7 +13,7 @@ from hiosdf_jax._src.command.timing import format_number, host_name, points_in, 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.field import baking, points
-from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.scoring.table import lay_out
 
 FRAMES = 20
@@ -59,7 +59,7 @@ def measure(
     for k in range(len(stream)):
         frames.append(stream[k])
         step("rendering" if k + 1 < len(stream) else "first update")
-    state = jax.block_until_ready(pipeline.init(config, jax.random.key(0)))
+    state = jax.block_until_ready(lifecycle.init(config, jax.random.key(0)))
     updates_s = []
     for cloud, pose in frames:
         start = time.perf_counter()
@@ -68,7 +68,7 @@ def measure(
         step("updates")
     updates_s = np.array(updates_s)
     later_ms = 1e3 * updates_s[max(config.warmup_updates, 1) :]  # the first ones train longer
-    field, where = pipeline.snapshot(state), points_in(config, queries)
+    field, where = lifecycle.snapshot(state), points_in(config, queries)
     bar.set_description("distances")
     queries_ms = time_calls(points.sdf_and_grad, field, where, seconds=seconds)
     step("baking")

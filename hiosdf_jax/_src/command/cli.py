@@ -243,7 +243,7 @@ def _tracker(options: argparse.Namespace) -> Tracker | None:
 
 def _view(options: argparse.Namespace) -> None:
     from hiosdf_jax._src.mapping.checkpoint import load
-    from hiosdf_jax._src.mapping.pipeline import snapshot
+    from hiosdf_jax._src.mapping.lifecycle import snapshot
     from hiosdf_jax._src.view.live import Viewer
 
     if options.export is not None:

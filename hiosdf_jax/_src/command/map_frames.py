@@ -16,7 +16,7 @@ from hiosdf_jax._src.command.progress import FrameDigest, Progress, SavedMap
 from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
-from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.scoring.held_out import draw_returns
 from hiosdf_jax._src.state import MapState
 
@@ -113,7 +113,7 @@ def fuse_frames(
     from tqdm import tqdm
 
     if resumed is None:
-        state, before = pipeline.init(config, key), Progress()
+        state, before = lifecycle.init(config, key), Progress()
     else:
         state, before = resumed.state, resumed.progress
     first, points_used, points_outside = (

@@ -8,7 +8,7 @@ from typing import Any
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.mapping import checkpoint
-from hiosdf_jax._src.mapping.pipeline import snapshot
+from hiosdf_jax._src.mapping.lifecycle import snapshot
 from hiosdf_jax._src.scoring import metrics
 from hiosdf_jax._src.state import MapState
 

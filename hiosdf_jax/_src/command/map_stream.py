@@ -22,7 +22,7 @@ from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.mapping import checkpoint, pipeline
+from hiosdf_jax._src.mapping import checkpoint, lifecycle
 from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring import held_out, metrics
 from hiosdf_jax._src.state import MapState, field_of
@@ -155,7 +155,7 @@ def run_stream(
     )
     if save_path is not None or mapped.stopped is not None:
         keep(mapped.state, mapped.progress)
-    queries = CompiledQueries(pipeline.snapshot(mapped.state))
+    queries = CompiledQueries(lifecycle.snapshot(mapped.state))
     if live is not None:
         live.finish(queries.field)
     scores = {}

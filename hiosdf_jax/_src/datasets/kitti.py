@@ -18,7 +18,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import numbered_files, open_regular, read_lines, read_rows
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.numerics.posed_cloud import check_pose
+from hiosdf_jax._src.numerics.intake import check_pose
 
 _BYTES = 16  # per point
 

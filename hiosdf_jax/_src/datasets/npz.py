@@ -26,7 +26,7 @@ from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import most_returns
 from hiosdf_jax._src.datasets.stream import frame_index
 from hiosdf_jax._src.datasets.truth import GroundTruth
-from hiosdf_jax._src.numerics.posed_cloud import check_pose
+from hiosdf_jax._src.numerics.intake import check_pose
 
 _depth_to_cloud = jax.jit(sensors.depth_to_cloud)
 _ranges_to_cloud = jax.jit(sensors.ranges_to_cloud)

@@ -18,8 +18,7 @@ import numpy as np
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, open_regular, parsing, read_rows
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.numerics.intake import as_number
-from hiosdf_jax._src.numerics.posed_cloud import check_pose
+from hiosdf_jax._src.numerics.intake import as_number, check_pose
 
 _INFO = ("replicaCAD_info.json", "cam_params.json")
 

@@ -15,7 +15,7 @@ import numpy as np
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.numerics.posed_cloud import check_pose
+from hiosdf_jax._src.numerics.intake import check_pose
 
 _SCALE = 1000.0  # depth is in mm
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hiosdf_jax._src.numerics.posed_cloud import check_pose, finite_rows
+from hiosdf_jax._src.numerics.intake import check_pose, cloud_and_returns
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 
 _POINTS_PER_FRAME = 5000  # drawn from each cloud
@@ -156,7 +156,7 @@ def read_frame(stream: Stream, index: int) -> tuple[np.ndarray, np.ndarray]:
     try:
         cloud, pose = stream[index]
         check_pose(pose)
-        finite_rows(cloud)
+        cloud_and_returns(cloud)
     except ValueError as error:
         raise BadFrameError(f"frame {index}: {' '.join(str(error).split())}") from error
     return cloud, pose

@@ -26,7 +26,7 @@ from hiosdf_jax._src.demo.sensing import (
     scan_from_above,
 )
 from hiosdf_jax._src.field.points import Unknown
-from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.state import Field
 
 # A body 0.4 m wide, from 0.15 m to 1.25 m above the floor.
@@ -102,7 +102,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
     camera = robot_camera(model)
     key, plan_key = jax.random.split(jax.random.key(seed))
     driver = make_driver(ROBOT, unknown, plan_key)
-    map_state = scan_from_above(pipeline.init(map_config(), key), problem.start[:2])
+    map_state = scan_from_above(lifecycle.init(map_config(), key), problem.start[:2])
 
     state, plan = jnp.array([*problem.start, 0.0, 0.0], jnp.float32), driver.plan
     watch = _Watch(problem.start[:2])
@@ -118,7 +118,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
             pitch = _PITCHES_LOOKING[len(moments) % 2] if watch.turning else _PITCH_DRIVING
             pose = camera_pose(np.asarray(state), float(pitch))
             map_state = pipeline.update(map_state, camera.cloud(pose, (seed, k)), pose)
-            field = pipeline.snapshot(map_state, k * ROBOT.step)
+            field = lifecycle.snapshot(map_state, k * ROBOT.step)
             task, path_from, cells = make_task(ROBOT, field, plane, problem.goal, barred)
             update_seconds.append(time.perf_counter() - start)
             rollouts = np.asarray(driver.rollouts(plan, state))[..., :2]

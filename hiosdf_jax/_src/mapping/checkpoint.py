@@ -15,7 +15,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.grid.distance import recompute_distances
-from hiosdf_jax._src.mapping.pipeline import init
+from hiosdf_jax._src.mapping.lifecycle import init
 from hiosdf_jax._src.mapping.stored_values import check_array, check_grid
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.output_files import replacing

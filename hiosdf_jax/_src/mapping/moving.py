@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.mapping.stages import CHECKS, begin, run_stages
-from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.intake import as_traced, check_pose, checked_cloud, is_traced
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.numerics.posed_cloud import as_traced, check_extras, check_pose, checked_cloud
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import MapState, check_map
 
 

@@ -1,8 +1,9 @@
-"""Makes a map, updates it with clouds, copies it for planners, and enlarges it."""
+"""A cloud on its way into the map: checked, brought to a fixed shape, and fused by one function."""
 
 from __future__ import annotations
 
-import dataclasses
+import warnings
+import zlib
 from typing import Any
 
 import jax
@@ -10,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid.evidence import empty_grid
-from hiosdf_jax._src.mapping.calibration import initial_optimism
 from hiosdf_jax._src.mapping.stages import (
     CHECKS,
     FUSION,
@@ -20,68 +19,21 @@ from hiosdf_jax._src.mapping.stages import (
     refuse,
     run_stages,
 )
-from hiosdf_jax._src.network.training import init_network
-from hiosdf_jax._src.numerics.arrays import on_device, scalar
-from hiosdf_jax._src.numerics.intake import as_array, as_key, is_traced
-from hiosdf_jax._src.numerics.modes import cond, plain
-from hiosdf_jax._src.numerics.posed_cloud import (
+from hiosdf_jax._src.numerics.arrays import scalar
+from hiosdf_jax._src.numerics.intake import (
     as_traced,
-    check_extras,
     check_pose,
-    checked_cloud,
-    pad_rows,
-    prepare,
-    warn_out_of_range,
-    warn_outside,
+    cloud_and_returns,
+    is_traced,
 )
-from hiosdf_jax._src.state import Field, MapState, Report, check_map, field_of
+from hiosdf_jax._src.numerics.modes import cond, plain
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras
+from hiosdf_jax._src.state import MapState, check_map
 
+_HASHED_EVERY = 64  # rows of a cloud per hashed row
+_TRIED_ROWS = 2000  # of a cloud that almost certainly has returns inside the bounds
 
-def init(config: Config, key: jax.Array) -> MapState:
-    """Makes an empty map.
-
-    Args:
-        config: The map's configuration.
-        key: Source of all the map's randomness, from `jax.random.key` (or `PRNGKey`).
-
-    Returns:
-        The map; its distances are those of an untrained network.
-
-    Raises:
-        ValueError: `config` is not a Config, or `key` is not one key.
-
-    Example:
-        >>> config = hio.Config.light(bounds=((0, 0, 0), (10, 8, 3)))
-        >>> state = hio.init(config, jax.random.key(0))
-    """
-    if not isinstance(config, Config):
-        raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
-    key = as_key("key", key)
-    key, network_key = jax.random.split(key)
-
-    def zero() -> jax.Array:  # one array per leaf, so that the state can be donated
-        return jnp.zeros((), jnp.int32)
-
-    return MapState(
-        config=config,
-        grid=empty_grid(config),
-        network=init_network(config, network_key),
-        optimism=initial_optimism(),
-        key=key,
-        updates=zero(),
-        report=Report(
-            points_used=zero(),
-            points_outside=zero(),
-            points_out_of_range=zero(),
-            points_invalid=zero(),
-            sdf_loss=jnp.zeros((), jnp.float32),
-            eikonal_loss=jnp.zeros((), jnp.float32),
-            points_moving=zero(),
-            refused_in_row=zero(),
-            update_flags=jnp.zeros((), jnp.uint32),
-            flags=jnp.zeros((), jnp.uint32),
-        ),
-    )
+_NO_FLAG = np.uint32(0)
 
 
 def update(
@@ -138,24 +90,32 @@ def update(
     check_map(state)
     extras = check_extras(robot, noise)
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
-        return trace_update(state, *as_traced(cloud, pose), *extras)
+        return run_update(state, *as_traced(cloud, pose), extras)
     config = state.config
     cloud, pose = prepare(cloud, pose, config.max_points)
     limits = (config.min_range, config.max_range, config.min_in_range)
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
+    cloud, pose = jax.device_put((cloud, pose))
     return run_update(state, cloud, pose, extras, scalar(0, np.uint32), donate)
 
 
 def run_update(
-    state: MapState, cloud: Any, pose: Any, extras: Any, raised: jax.Array, donate: bool
+    state: MapState,
+    cloud: jax.Array,
+    pose: jax.Array,
+    extras: Any,
+    raised: jax.Array | np.uint32 = _NO_FLAG,
+    donate: bool = False,
 ) -> MapState:
     """Runs the compiled update, the same one for `update` and for tracking.
 
+    Inside jit it is a call of a function of its own, which is traced once however often it is used.
+
     Args:
         state: The map so far.
-        cloud: (max_points, 3) float32, checked and padded.
-        pose: (4, 4) float32.
+        cloud: (N, 3) float32. Outside jit checked, padded, and on the device.
+        pose: (4, 4) float32, likewise.
         extras: `robot` and `noise`, checked.
         raised: Flags that refuse the cloud already, () uint32.
         donate: As for `update`.
@@ -164,7 +124,7 @@ def run_update(
         The new map.
     """
     compiled = _update_donating if donate else _update_jit
-    return compiled(state, jax.device_put(cloud), jax.device_put(pose), *extras, raised)
+    return compiled(state, cloud, pose, *extras, raised)
 
 
 def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
@@ -194,82 +154,168 @@ def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
     if is_traced(cloud):
         raise ValueError("cloud is traced, expected concrete numbers: call pad_cloud outside jit")
     pose = None if pose is None else check_pose(pose)
-    return pad_rows(checked_cloud(cloud), config.max_points, pose)
+    return _pad_rows(*cloud_and_returns(cloud), config.max_points, pose)
 
 
-def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
-    """Copies what queries need, so that a planner can hold it while the map is updated.
-
-    Args:
-        state: The map.
-        stamp: Time of the snapshot, s on the caller's clock. It is stored as float32, so count from
-            the start of the run.
-
-    Returns:
-        A field that shares no memory with the map.
-
-    Raises:
-        ValueError: `state` is not a map, or `stamp` is not one number, finite in float32.
-
-    Example:
-        field = hio.snapshot(state, stamp=12.5)
-        distance = hio.sdf(field, [1.0, 2.0, 0.5])  # while `state` is updated
-    """
-    check_map(state, stacked=True)
-    seconds = as_array("stamp", stamp)
-    if seconds.shape != () or not (is_traced(seconds) or np.isfinite(jax.device_get(seconds))):
-        raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
-    field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=on_device("stamp", seconds))
-
-
-def grow(state: MapState, bounds: Any) -> MapState:
-    """Enlarges the box of a map and keeps its content.
+def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Checks the values of a cloud and its pose, and brings the cloud to a fixed shape.
 
     Args:
-        state: The map. Not inside jit, since the arrays change their shapes.
-        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; they contain the old bounds.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
+        pose: (4, 4) T_world_sensor.
+        capacity: Rows of the result, see `_pad_rows`.
 
     Returns:
-        The map in the new box. It shares no memory with the old map, and answers bit by bit as
-        before inside the old box.
+        The cloud (capacity, 3) and the pose, float32.
 
     Raises:
-        ValueError: `state` is not a map, or traced; or the new bounds do not contain the old ones,
-            or are none.
-
-    Example:
-        state = hio.grow(state, ((-5, -5, 0), (15, 10, 3)))  # it must contain the old box
+        ValueError: A shape is wrong, the pose is not finite or not rigid, or the cloud has no
+            finite row.
     """
-    check_map(state)
-    if is_traced(*jax.tree.leaves(state)):
-        raise ValueError("state is traced, expected a map: call grow outside jit")
-    old = state.config
-    new = dataclasses.replace(old, bounds=bounds)
-    contained = np.all(np.asarray(new.bounds[0]) <= old.bounds[0]) and np.all(
-        np.asarray(new.bounds[1]) >= old.bounds[1]
+    (cloud, finite), pose = cloud_and_returns(cloud), check_pose(pose)
+    return _pad_rows(cloud, finite, capacity, pose), pose
+
+
+def _pad_rows(
+    cloud: np.ndarray, finite: np.ndarray, capacity: int, pose: np.ndarray | None
+) -> np.ndarray:
+    """Brings a cloud to a fixed shape.
+
+    Args:
+        cloud: (N, 3) float32, m.
+        finite: A mask of its returns, (N,) bool.
+        capacity: Rows of the result. Smaller clouds are padded with NaN; larger ones are drawn from
+            at random.
+        pose: (4, 4) float32; other poses draw other rows.
+
+    Returns:
+        (capacity, 3) float32.
+    """
+    padded = np.empty((capacity, 3), np.float32)
+    count = len(cloud)
+    if count <= capacity:
+        padded[:count] = cloud
+    else:
+        # The draw must be a function of the arguments, and differ from cloud to cloud.
+        start = 0 if pose is None else zlib.crc32(pose.tobytes())
+        seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), start)
+        rows = _draw(finite, seed, capacity)
+        count = len(rows)
+        np.take(cloud, rows, axis=0, out=padded[:count], mode="clip")  # "raise" copies twice
+    padded[count:] = np.nan
+    return padded
+
+
+def _draw(finite: np.ndarray, seed: int, capacity: int) -> np.ndarray:
+    """Draws the indices of at most `capacity` finite rows."""
+    rows = np.flatnonzero(finite)
+    dropped = len(rows) - capacity
+    if dropped <= 0:
+        return rows
+    rng = np.random.default_rng(seed)
+    # Draws with repetition until enough rows are distinct: the rows to keep or those to drop,
+    # whichever are fewer. A permutation would touch every row of a large cloud.
+    fewer = min(capacity, dropped)
+    chosen = np.zeros(len(rows), bool)
+    while missing := fewer - np.count_nonzero(chosen):
+        chosen[rng.integers(len(rows), size=missing)] = True
+    return rows[np.flatnonzero(chosen if fewer == capacity else ~chosen)]
+
+
+def warn_out_of_range(
+    cloud: np.ndarray, min_range: float, max_range: float, min_share: float
+) -> bool:
+    """Warns of a cloud with almost no return in range, and names the likely unit.
+
+    Args:
+        cloud: (N, 3) m, sensor frame; rows with a NaN are no returns.
+        min_range: Least range of a return that counts, m.
+        max_range: Largest range of a return that counts, m.
+        min_share: Least share of the returns that must be in range.
+
+    Returns:
+        Whether it warned.
+    """
+    square = _square_ranges(cloud)
+    square = square[np.isfinite(square)]
+    usable = np.count_nonzero((square >= min_range**2) & (square <= max_range**2))
+    if usable >= min_share * len(square):
+        return False
+    middle = float(np.sqrt(np.median(square)))
+    units = {"centimeters": 100, "millimeters": 1000}
+    likely = [unit for unit, per_m in units.items() if min_range <= middle / per_m <= max_range]
+    warnings.warn(
+        f"cloud has {usable} of {len(square)} returns between min_range, {min_range:g} m, and "
+        f"max_range, {max_range:g} m; the median range is {middle:.3g} m. The map ignores it. "
+        + (
+            f"It looks like {' or '.join(likely)}, expected m"
+            if likely
+            else f"Its unit must be m; Config.min_in_range is {min_share:g}"
+        ),
+        stacklevel=3,
     )
-    if not contained:
-        raise ValueError(f"bounds is {bounds!r}, expected a box that contains {old.bounds!r}")
-    start = np.subtract(old.corner_index, new.corner_index)
-    place = tuple(slice(a, a + n) for a, n in zip(start, old.grid_shape, strict=True))
-    grid = jax.tree.map(
-        lambda empty, known: empty.at[place].set(known), empty_grid(new), state.grid
+    return True
+
+
+def warn_outside(
+    cloud: np.ndarray,
+    pose: np.ndarray,
+    bounds: Any,
+    min_range: float,
+    max_range: float,
+    min_share: float,
+) -> None:
+    """Warns of a cloud with almost no return inside the bounds, among those in range.
+
+    Args:
+        cloud: (N, 3) m, sensor frame; rows with a NaN are no returns.
+        pose: (4, 4) T_world_sensor.
+        bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame.
+        min_range: Least range of a return that counts, m.
+        max_range: Largest range of a return that counts, m.
+        min_share: Least share of the returns in range that must lie inside.
+    """
+
+    def count(rows: np.ndarray) -> tuple[int, int]:
+        """Counts the returns in range, and those of them inside."""
+        square = _square_ranges(rows)
+        inside = in_range = (square >= min_range**2) & (square <= max_range**2)
+        with np.errstate(over="ignore", invalid="ignore"):  # rows that are not in range
+            for k in range(3):
+                world = rows @ pose[k, :3] + pose[k, 3]
+                inside = inside & (world >= bounds[0][k]) & (world <= bounds[1][k])
+        return int(np.count_nonzero(in_range)), int(np.count_nonzero(inside))
+
+    some_in_range, some_inside = count(cloud[:: -(-len(cloud) // _TRIED_ROWS)])
+    if some_inside and some_inside >= min_share * some_in_range:
+        return
+    in_range, inside = count(cloud)
+    if inside >= min_share * in_range:
+        return
+    # Without numbers of this cloud: Python shows an equal message once, and not at 30 Hz.
+    warnings.warn(
+        f"cloud has less than {100 * min_share:g} % of its returns in range inside the bounds, "
+        f"{bounds}: is the pose wrong, the cloud in the world frame, or the box too small? Its "
+        "rays clear space, but those returns leave no surface. Config.min_in_range=0 turns this "
+        "warning off",
+        stacklevel=3,
     )
-    rest = jax.tree.map(jnp.copy, state.replace(grid=None))  # so that either map can be donated
-    return rest.replace(config=new, grid=grid)
+
+
+def _square_ranges(cloud: np.ndarray) -> np.ndarray:
+    x, y, z = cloud.T.astype(np.float64)  # a finite row must not overflow
+    return x * x + y * y + z * z
 
 
 @plain
-def trace_update(
+def _update(
     state: MapState,
     cloud: jax.Array,
     pose: jax.Array,
-    robot: tuple[jax.Array, jax.Array] | None = None,
-    noise: jax.Array | None = None,
-    raised: jax.Array | int = 0,
+    robot: tuple[jax.Array, jax.Array] | None,
+    noise: jax.Array | None,
+    raised: jax.Array | np.uint32,
 ) -> MapState:
-    """Updates a map inside jit, where shapes are used as they are; see `run_update`."""
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
@@ -283,6 +329,6 @@ def trace_update(
     )
 
 
-_update_jit = jax.jit(trace_update)
+_update_jit = jax.jit(_update)
 # Also leaves that an update does not read are donated.
-_update_donating = jax.jit(trace_update, donate_argnums=0, keep_unused=True)
+_update_donating = jax.jit(_update, donate_argnums=0, keep_unused=True)

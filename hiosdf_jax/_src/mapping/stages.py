@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient as held  # derivatives take it as it is
 
 from hiosdf_jax._src.change import directions, hiding, novelty, robot, smoothing, stray, vanishing
@@ -19,8 +20,8 @@ from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches,
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.mapping import calibration
 from hiosdf_jax._src.network import training
-from hiosdf_jax._src.numerics.posed_cloud import extras_are_valid
 from hiosdf_jax._src.numerics.rigid import is_rigid
+from hiosdf_jax._src.numerics.robot_and_noise import extras_are_valid
 from hiosdf_jax._src.samples import from_cloud, from_grid
 from hiosdf_jax._src.samples.draw import Samples, concatenate
 from hiosdf_jax._src.state import Flag, Grid, MapState, Report, field_of
@@ -99,7 +100,7 @@ def begin(
     pose: jax.Array,
     robot: tuple[jax.Array, jax.Array] | None = None,
     noise: jax.Array | None = None,
-    raised: jax.Array | int = 0,
+    raised: jax.Array | np.uint32 | int = 0,
 ) -> Step:
     """Starts an update: draws its keys, stores the next one in the map, adds to flags raised."""
     flags = raised | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
-from hiosdf_jax._src.mapping.pipeline import run_update, trace_update
+from hiosdf_jax._src.mapping.pipeline import prepare, run_update
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
@@ -17,9 +17,9 @@ from hiosdf_jax._src.mapping.registration.refining import (
     refine_pose,
 )
 from hiosdf_jax._src.numerics.arrays import on_device
-from hiosdf_jax._src.numerics.intake import as_array, is_traced
+from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.numerics.posed_cloud import as_traced, check_extras, check_pose, prepare
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import Flag, MapState, check_map
 
 REACH_M = 0.2
@@ -86,13 +86,14 @@ def track(
         cloud, pose = as_traced(cloud, predicted_pose)
         found = refine_pose(state, cloud, pose, prior, noise=noise)
         found, raised = _register(state.updates, pose, found, _covariance_of(prior), reach)
-        return trace_update(state, cloud, found.pose, None, checked_noise, raised), found
+        return run_update(state, cloud, found.pose, (None, checked_noise), raised), found
     padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
     chosen = _prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
     found, raised = _register_jit(state.updates, jax.device_put(pose), found, own, reach)
-    return run_update(state, padded, found.pose, (None, checked_noise), raised, donate), found
+    cloud = jax.device_put(padded)
+    return run_update(state, cloud, found.pose, (None, checked_noise), raised, donate), found
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:

@@ -1,4 +1,4 @@
-"""The one way in for numbers: they become float32, or a ValueError names the argument.
+"""The one way in for numbers, clouds and poses: float32, or a ValueError that names the argument.
 
 Numbers of any real type come in, in any byte order. Strings, booleans, complex numbers, times and
 Python objects, among them whole numbers beyond 64 bits, do not.
@@ -13,6 +13,8 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 
 _DEEPEST = 16  # an array has three axes or four
 _MOST_WHOLE = 2**31 - 1  # a loop counts in int32
@@ -165,6 +167,85 @@ def as_key(name: str, key: Any) -> jax.Array:
     )
 
 
+def as_traced(cloud: Any, pose: Any) -> tuple[jax.Array, jax.Array]:
+    """Checks types and shapes only, which tracers have as well.
+
+    Args:
+        cloud: Expected (N, 3).
+        pose: Expected (4, 4).
+
+    Returns:
+        Both as arrays of JAX, float32.
+
+    Raises:
+        ValueError: A type or a shape is wrong.
+    """
+    cloud, pose = as_array("cloud", cloud), as_array("pose", pose)
+    _check_cloud_shape(cloud)
+    _check_pose_shape(pose)
+    return jnp.asarray(cloud), jnp.asarray(pose)
+
+
+def checked_cloud(cloud: Any) -> np.ndarray:
+    """Checks a cloud, and returns it as (N, 3) float32; masked elements are NaN.
+
+    Raises:
+        ValueError: It is no array of real numbers, or misshapen.
+    """
+    floats = as_floats("cloud", cloud)
+    _check_cloud_shape(floats)
+    return floats
+
+
+def cloud_and_returns(cloud: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Checks a cloud and finds its returns.
+
+    Args:
+        cloud: (N, 3) m; a row with a NaN or inf is no return.
+
+    Returns:
+        The cloud as from `checked_cloud`, and a mask of its returns, (N,) bool, at least one of
+        them True.
+
+    Raises:
+        ValueError: The cloud is misshapen or has no return.
+    """
+    floats = checked_cloud(cloud)
+    x, y, z = floats.T  # one column at a time is many times faster than all(axis=1)
+    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    if not finite.any():
+        raise ValueError(
+            f"cloud has no finite row among its {len(finite)}, expected at least one return"
+        )
+    return floats, finite
+
+
+def check_pose(pose: Any, source: str = "") -> np.ndarray:
+    """Checks that a pose is a rigid transform.
+
+    Args:
+        pose: (4, 4) T_world_sensor.
+        source: Where the pose comes from, such as a file and a line. The message starts with it.
+
+    Returns:
+        (4, 4) float32, a copy of the pose.
+
+    Raises:
+        ValueError: The pose is misshapen, not finite or not rigid.
+    """
+    prefix = f"{source}: " if source else ""
+    matrix = np.array(as_floats(f"{prefix}pose", pose))  # too large for float32: inf, refused below
+    _check_pose_shape(matrix, prefix)
+    if not np.isfinite(matrix).all():
+        raise ValueError(
+            f"{prefix}pose has values that are not finite, expected T_world_sensor: "
+            f"{_printed(matrix)}"
+        )
+    if not is_rigid(matrix, np):
+        raise ValueError(f"{prefix}pose {_pose_fault(matrix)}: {_printed(matrix)}")
+    return matrix
+
+
 def is_traced(*values: Any) -> bool:
     """Returns whether some values, or members of their lists and tuples, are traced by JAX."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in _leaves(values))
@@ -196,3 +277,36 @@ def _check_type(name: str, array: Any) -> None:
     real = jnp.issubdtype(dtype, np.floating) or jnp.issubdtype(dtype, np.integer)
     if not real or dtype.kind == "m":  # numpy counts spans of time among the integers
         raise ValueError(f"{name} has dtype {dtype}, expected real numbers")
+
+
+def _check_cloud_shape(cloud: Any) -> None:
+    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
+        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
+
+
+def _check_pose_shape(pose: Any, prefix: str = "") -> None:
+    if np.shape(pose) != (4, 4):
+        raise ValueError(f"{prefix}pose has shape {np.shape(pose)}, expected (4, 4)")
+
+
+def _pose_fault(pose: np.ndarray) -> str:
+    """Says in words why a finite pose is refused."""
+    rotation, position = pose[:3, :3].astype(np.float64), pose[:3, 3].astype(np.float64)
+    gram = rotation.T @ rotation
+    lengths = np.sqrt(np.diag(gram))
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        hint = "; is it transposed?" if is_rigid(pose.T, np) else ""
+        return f"is not rigid: its last row is {_printed(pose[3])}, expected [0, 0, 0, 1]{hint}"
+    if np.abs(lengths**2 - 1).max() > TOLERANCE:
+        length = f"{lengths[0]:.4g}" if np.ptp(lengths) <= TOLERANCE else _printed(lengths)
+        return f"is not rigid: its columns have length {length}, expected 1"
+    if np.linalg.det(rotation) < 0:
+        return "is not rigid: its determinant is -1, expected 1; it mirrors the cloud"
+    if np.abs(position).max() > FARTHEST_M:
+        kilometers = np.linalg.norm(position) / 1000
+        return f"is {kilometers:.4g} km from the origin, expected at most {FARTHEST_M / 1000:g} km"
+    return "is not rigid: its columns are not perpendicular, expected a rotation"
+
+
+def _printed(matrix: np.ndarray) -> str:
+    return " ".join(np.array2string(matrix, precision=4, separator=", ").split())  # in one line

@@ -11,7 +11,7 @@ import jax
 from hiosdf_jax._src.mapping.pipeline import update
 from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.intake import as_floats
-from hiosdf_jax._src.numerics.posed_cloud import check_extras
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, field_of
 
 type Serve = Callable[[Field], Field | Baked] | None

@@ -18,9 +18,8 @@ from hiosdf_jax._src.mapping.joining.adding import Moved, sum_evidence
 from hiosdf_jax._src.mapping.joining.rebinning import coincides, passes_at, rebin
 from hiosdf_jax._src.network.frames import move_network
 from hiosdf_jax._src.network.training import least_epochs, train
-from hiosdf_jax._src.numerics.intake import as_array, is_traced
+from hiosdf_jax._src.numerics.intake import as_array, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain, varying_like
-from hiosdf_jax._src.numerics.posed_cloud import check_pose
 from hiosdf_jax._src.numerics.rigid import is_rigid, nearest_rotation
 from hiosdf_jax._src.samples.from_grid import sample_grid
 from hiosdf_jax._src.state import Flag, Grid, MapState, Network, check_single

@@ -30,14 +30,15 @@ from hiosdf_jax._src.mapping.registration.solving import (
 )
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, inflation_of
 from hiosdf_jax._src.numerics.arrays import scalar
-from hiosdf_jax._src.numerics.intake import as_floats, as_number, is_traced
-from hiosdf_jax._src.numerics.posed_cloud import (
+from hiosdf_jax._src.numerics.intake import (
+    as_floats,
+    as_number,
     as_traced,
-    check_extras,
     check_pose,
-    checked_cloud,
-    finite_rows,
+    cloud_and_returns,
+    is_traced,
 )
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import Baked, Field
 
 # Rows of a cloud from which the others are selected.
@@ -117,8 +118,7 @@ def refine_pose(
     reach = checked_reach(reach_m)
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach)
-    floats = checked_cloud(cloud)
-    finite_rows(floats)
+    floats, _ = cloud_and_returns(cloud)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
     rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
     padded = np.full((rows, 3), np.nan, np.float32)

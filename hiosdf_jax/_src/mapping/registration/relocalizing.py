@@ -26,9 +26,15 @@ from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_ang
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import solve_coarse, take_evenly
-from hiosdf_jax._src.numerics.intake import as_array, as_key, check_whole, is_traced
+from hiosdf_jax._src.numerics.intake import (
+    as_array,
+    as_key,
+    as_traced,
+    check_whole,
+    cloud_and_returns,
+    is_traced,
+)
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.numerics.posed_cloud import as_traced, checked_cloud, finite_rows
 from hiosdf_jax._src.state import Baked, Field
 
 # A sensor is at least this far from surfaces, m.
@@ -114,8 +120,7 @@ def relocalize(
     if traced:
         cloud, _ = as_traced(cloud, jnp.eye(4))
     else:
-        cloud = checked_cloud(cloud)
-        finite_rows(cloud)
+        cloud, _ = cloud_and_returns(cloud)
     points, some = _draw(cloud)
     poses = _find_places(field, points, some, key, *ups, hypotheses)
     if traced:
