@@ -3,6 +3,7 @@
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from room import stream
 
@@ -19,12 +20,15 @@ def frame():
 
 @pytest.fixture(scope="module")
 def program(empty_map, frame):
-    """What `update` computes, as a jaxpr."""
+    """What `update` computes, as a jaxpr: that of the one function that it calls."""
 
     def update(state, cloud, pose, *noise):
         return hio.update(state, cloud, pose, noise=noise)
 
-    return jax.make_jaxpr(update)(empty_map, *frame)
+    calls = jax.make_jaxpr(update)(empty_map, *frame).eqns
+    called = [call.params["jaxpr"] for call in calls if call.params.get("name") == "_update"]
+    assert called == [calls[-1].params["jaxpr"]]
+    return called[0]
 
 
 def scopes(equations):
@@ -66,10 +70,9 @@ def test_update_is_the_stages_one_by_one(program, empty_map, frame):
             step = stage(step)
         return step.state
 
-    def by_hand(state, cloud, pose, *noise):
-        _, noise = check_extras(None, noise)
+    def by_hand(state, cloud, pose, noise, raised):
         finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-        step = begin(state, cloud, finite, pose, noise=noise)
+        step = begin(state, cloud, finite, pose, noise=noise, raised=raised)
         for stage in CHECKS:
             step = stage(step)
         return jax.lax.cond(is_accepted(step), fused, refuse, state, step)
@@ -77,4 +80,7 @@ def test_update_is_the_stages_one_by_one(program, empty_map, frame):
     def text(jaxpr):  # without the mark between constants and arguments
         return " ".join(str(jaxpr).replace(";", "").split())
 
-    assert text(program) == text(jax.make_jaxpr(by_hand)(empty_map, *frame))
+    cloud, pose, *noise = frame
+    _, noise = check_extras(None, noise)
+    expected = jax.make_jaxpr(by_hand)(empty_map, cloud, pose, noise, np.uint32(0))
+    assert text(program) == text(expected)
