@@ -1,7 +1,8 @@
 """Maps streams whose poses drift, jump or are missing, and finds frames in a finished map.
 
     python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --poses jitter
-    python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --poses none
+    python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --poses none --kiss-icp
+    python -m benchmarks.tracking --stream demo --frames 240 --poses exact drift none --kiss-icp
     python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --relocalize 100
 
 `--poses` says what is done to the stream's poses before they are refined:
@@ -10,7 +11,11 @@
 - `jitter`: each is off by 2 cm and 1 degree, in random directions
 - `jitter known`: the same, and each is a prior with that standard deviation
 - `glitch`: five of them are off by 1 m
+- `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
 - `none`: only the first is used
+
+`--stream demo` is the apartment; 240 frames are 10 Hz at 1 m/s. `--kiss-icp` measures the odometry
+of KISS-ICP on the same clouds beside; it needs `pip install kiss-icp`.
 """
 
 from __future__ import annotations
@@ -21,14 +26,25 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
 from benchmarks.registration import error, perturb
-from hiosdf_jax import datasets, scoring
+from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
 
-MODES = ("exact", "jitter unrefined", "jitter", "jitter known", "glitch", "none")
+MODES = (
+    "exact",
+    "jitter unrefined",
+    "jitter",
+    "jitter known",
+    "glitch",
+    "drift unrefined",
+    "drift",
+    "none",
+)
+DRIFT = 0.01, 0.05  # of the way, degrees per meter
 JITTER = 0.02, 1.0  # m, degrees
 GLITCH = range(60, 65)
 
@@ -45,6 +61,13 @@ def change(exact, mode):
     if mode == "glitch":
         for i in GLITCH:
             given[i][:3, 3] += [0.6, 0.8, 0]
+    if mode.startswith("drift"):
+        for i in range(1, len(exact)):
+            step = np.linalg.inv(exact[i - 1]) @ exact[i]
+            turn = np.radians(DRIFT[1]) * np.linalg.norm(step[:3, 3])
+            step[:3, 3] *= 1 + DRIFT[0]
+            given[i] = given[i - 1] @ step
+            given[i][:3, :3] = Rotation.from_euler("z", turn).as_matrix() @ given[i][:3, :3]
     return given
 
 
@@ -58,7 +81,7 @@ def map_stream(frames, config, mode):
     poses, refused = [], []
     for i, (cloud, _) in enumerate(frames):
         pose, fused = given[i], True
-        if mode in ("exact", "jitter unrefined"):
+        if mode == "exact" or mode.endswith("unrefined"):
             state = hio.update(state, cloud, pose)
         elif mode.startswith("jitter"):
             known = (pose, prior) if mode == "jitter known" else None
@@ -73,19 +96,39 @@ def map_stream(frames, config, mode):
     return state, poses, refused
 
 
+def describe(poses, frames):
+    """Says how far poses are from the exact ones, which they share at the first frame."""
+    away = np.stack([error(a, b) for a, (_, b) in zip(poses, frames, strict=True)])
+    way = 100 * np.linalg.norm(away[:, :3], axis=1)
+    angle = np.degrees(np.linalg.norm(away[:, 3:], axis=1))
+    return (
+        f"poses off by {np.sqrt(np.mean(way**2)):.2f} cm (root mean square), "
+        f"{way.max():.2f} cm (most), {way[-1]:.2f} cm and {angle[-1]:.2f} deg (end)"
+    )
+
+
+def print_kiss_icp(stream, frames, max_range):
+    """Prints the errors of KISS-ICP's odometry, with its own default settings."""
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    config = KISSConfig()
+    config.data.max_range, config.data.min_range, config.data.deskew = max_range, 0.0, False
+    config.mapping.voxel_size = max_range / 100
+    odometry, poses, begin = KissICP(config), [], time.perf_counter()
+    for cloud, _ in frames:
+        points = np.asarray(cloud[np.isfinite(cloud).all(axis=1)], np.float64)
+        odometry.register_frame(points, np.zeros(len(points)))
+        poses.append(frames[0][1] @ odometry.last_pose)
+    print(f"{stream}, KISS-ICP: {describe(poses, frames)}; {time.perf_counter() - begin:.0f} s")
+
+
 def print_tracking(stream, frames, config, truth, mode):
     """Maps a stream and prints the errors of the poses and of the map."""
     begin = time.perf_counter()
     state, poses, refused = map_stream(frames, config, mode)
-    exact = [pose for _, pose in frames]
-    away = np.stack([error(a, b) for a, b in zip(poses, exact, strict=True)])
-    way = 100 * np.linalg.norm(away[:, :3], axis=1)
-    angle = np.degrees(np.linalg.norm(away[:, 3:], axis=1))
-    print(
-        f"{stream}, {mode}: poses off by {np.sqrt(np.mean(way**2)):.2f} cm (root mean square), "
-        f"{way.max():.2f} cm (most), {way[-1]:.2f} cm and {angle[-1]:.2f} deg (end); "
-        f"not registered: {refused}; {time.perf_counter() - begin:.0f} s"
-    )
+    print(f"{stream}, {mode}: {describe(poses, frames)}; not registered: {refused}; ", end="")
+    print(f"{time.perf_counter() - begin:.0f} s", flush=True)
     if truth is not None:
         queries = CompiledQueries(hio.snapshot(state))
         scores = scoring.evaluate(queries.sdf_and_grad, truth, last_frame=len(frames) - 1)
@@ -122,27 +165,39 @@ def print_relocalization(stream, frames, state, count, up_world):
 
 def main():
     parser = argparse.ArgumentParser(description="Tracks streams and relocalizes frames.")
-    parser.add_argument("--stream", type=Path, required=True, help="a recording")
+    parser.add_argument("--stream", type=Path, required=True, help="a recording, or demo")
     parser.add_argument("--poses", choices=MODES, nargs="*", default=[], help="see above")
     parser.add_argument("--relocalize", type=int, default=0, help="frames to find")
     parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
-    parser.add_argument("--frames", type=int, help="use only the first ones")
+    parser.add_argument(
+        "--frames", type=int, help="use only the first ones; the demo has this many"
+    )
+    parser.add_argument("--kiss-icp", action="store_true", help="measure KISS-ICP, too")
     arguments = parser.parse_args()
-    stream = datasets.open_stream(arguments.stream)
-    bounds, max_range = datasets.find_bounds(stream)
+    if is_demo := str(arguments.stream) == "demo":
+        stream = demo.ApartmentStream(arguments.frames or 240)
+        bounds, max_range = demo.BOUNDS_WORLD, stream.max_range
+        truth = demo.sample_truth(stream)
+    else:
+        stream = datasets.open_stream(arguments.stream)
+        bounds, max_range = datasets.find_bounds(stream)
+        truth = datasets.read_truth(arguments.stream)
     config = hio.Config.light(bounds, max_range=max_range)
     frames = [stream[i] for i in range(arguments.frames or len(stream))]
-    truth = datasets.read_truth(arguments.stream)
     name = arguments.stream.stem
     for mode in arguments.poses:
         print_tracking(name, frames, config, truth, mode)
+    if arguments.kiss_icp:
+        print_kiss_icp(name, frames, max_range)
     if arguments.relocalize:
         if arguments.map:
             state = hio.load(arguments.map)
         else:
             state = map_stream(frames, config, "exact")[0]
-        with np.load(arguments.stream) as file:
-            up_world = file["floor_normal"] if "floor_normal" in file else np.array([0, 0, 1.0])
+        up_world = np.array([0, 0, 1.0])
+        if not is_demo:
+            with np.load(arguments.stream) as file:
+                up_world = file.get("floor_normal", up_world)
         up_world = up_world * np.sign(up_world[2]) / np.linalg.norm(up_world)
         print_relocalization(name, frames, state, arguments.relocalize, up_world)
 
