@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from room import BOUNDS, CONFIG
@@ -10,6 +11,7 @@ from room import BOUNDS, CONFIG
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid import frontier, geometry
 from hiosdf_jax._src.grid.evidence import is_observed
+from hiosdf_jax._src.numerics import shifts
 
 signed_box_distance = jax.jit(frontier.signed_box_distance, static_argnums=1)
 
@@ -39,6 +41,17 @@ def test_box_distance_is_exact(seed, share, reach):
     expected = brute_force(inside, reach)
     # Beyond the reach along an axis nothing is looked for.
     np.testing.assert_allclose(result, np.clip(expected, -reach, reach), atol=1e-5)
+
+
+@pytest.mark.parametrize("number", [2, 8])
+def test_steps_of_several_shifts_find_the_same(monkeypatch, number):
+    """As a GPU takes them, where they do and do not divide all shifts."""
+    inside = jnp.asarray(np.random.default_rng(3).random((7, 12, 9)) < 0.9)
+    expected = np.asarray(signed_box_distance(inside, 8))
+    monkeypatch.setattr(shifts, "_UNROLL", number)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    search = jax.jit(lambda inside: frontier.signed_box_distance(inside, 8))
+    np.testing.assert_array_equal(np.asarray(search(inside)), expected)
 
 
 def test_without_the_other_kind_the_distance_is_the_reach():

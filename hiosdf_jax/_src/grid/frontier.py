@@ -11,7 +11,7 @@ from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.modes import varying_like
-from hiosdf_jax._src.numerics.shifts import pad_axis
+from hiosdf_jax._src.numerics.shifts import hold, pad_axis, unroll
 from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
 
 _INFINITE = 1e12  # squared voxels
@@ -42,8 +42,8 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
     """Finds the least distance over shifts: to the shifted voxel, or to what it is near."""
     reach = min(reach, inside.shape[axis] - 1)
     # The remaining distance across the axis, for a voxel inside and for one outside.
-    to_outside = pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE)
-    to_inside = pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE)
+    to_outside = hold(pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE))
+    to_inside = hold(pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE))
 
     def compare(k: jax.Array, best: jax.Array) -> jax.Array:
         for step in (-k, k):
@@ -51,9 +51,8 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
             best = jnp.minimum(best, across + (k.astype(jnp.float32) - 0.5) ** 2)
         return best
 
-    return jax.lax.fori_loop(
-        np.int32(1), np.int32(reach + 1), compare, varying_like(squared, inside)
-    )
+    start = varying_like(squared, inside)
+    return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, start, unroll=unroll())
 
 
 def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:

@@ -10,6 +10,8 @@ import numpy as np
 
 from hiosdf_jax._src.numerics.modes import cond
 
+_UNROLL = 8  # shifts in either direction, so that a GPU starts fewer kernels
+
 
 class Padded(NamedTuple):
     """An array with a margin at both ends of one axis.
@@ -51,6 +53,19 @@ def pad_axis(array: jax.Array, axis: int, reach: int, fill: float = 0) -> Padded
     margin = [(0, 0)] * array.ndim
     margin[axis] = (reach, reach)
     return Padded(jnp.pad(array, margin, constant_values=fill), axis, reach)
+
+
+def hold(padded: Padded) -> Padded:
+    """Has a padded array computed once, however many shifts of it are used."""
+    return padded._replace(values=jax.lax.optimization_barrier(padded.values))
+
+
+def unroll() -> int:
+    """Returns how many shifts a loop over them takes per step: few, large steps suit a GPU.
+
+    A CPU takes one, which compiles faster and runs as fast.
+    """
+    return 1 if jax.default_backend() == "cpu" else _UNROLL
 
 
 def with_neighbors(mask: jax.Array) -> jax.Array:
