@@ -109,8 +109,8 @@ def describe(poses, frames):
 
 def print_kiss_icp(stream, frames, max_range):
     """Prints the errors of KISS-ICP's odometry, with its own default settings."""
-    from kiss_icp.config import KISSConfig
-    from kiss_icp.kiss_icp import KissICP
+    from kiss_icp.config import KISSConfig  # pyright: ignore[reportMissingImports]
+    from kiss_icp.kiss_icp import KissICP  # pyright: ignore[reportMissingImports]
 
     config = KISSConfig()
     config.data.max_range, config.data.min_range, config.data.deskew = max_range, 0.0, False
