@@ -166,10 +166,10 @@ def fuse_frames(
         updates = int(state.updates)
         start = time.perf_counter()
         if i >= first:
-            if tracker is None:
-                state = pipeline.update(state, cloud, pose)
-            else:
+            if tracker is not None:
                 state, pose = tracker.fuse(state, cloud, pose, i)
+            else:
+                state = pipeline.update(state, cloud, pose)
             jax.block_until_ready(state)
         path_world.append(pose[:3, 3])
         ups_world.append(up_of_frame(cloud, pose))
