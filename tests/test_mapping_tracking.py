@@ -76,15 +76,17 @@ def test_a_young_map_takes_what_it_cannot_judge(empty_map):
 
 
 def test_scan_and_one_frame_after_another_agree(sharp_map):
-    frames = [room_cloud(i, COUNT, 0.05 * i, (0.02 * i, 0.01 * i, 0.0)) for i in range(3)]
+    frames = [room_cloud(i, COUNT, 0.05 * i, (0.02 * i, 0.01 * i, 0.0)) for i in range(4)]
     clouds = np.stack([cloud for cloud, _ in frames])
     clouds[1] = foreign()
+    heights = clouds[3] @ frames[3][1][2, :3]
+    clouds[3][heights > heights.min() + 0.01] = np.nan  # of a floor alone, the prediction decides
     poses = np.stack([moved(pose, [0.01, 0, 0], [0, 0, 0.01]) for _, pose in frames])
     state, founds = sharp_map, []
     for cloud, pose in zip(clouds, poses, strict=True):
         state, found = hio.track(state, cloud, pose)
         founds.append(found)
-    assert [bool(found.converged) for found in founds] == [True, False, True]
+    assert [bool(found.converged) for found in founds] == [True, False, True, True]
 
     after, scanned = jax.lax.scan(
         lambda state, frame: hio.track(state, *frame), sharp_map, (clouds, poses)
@@ -93,7 +95,9 @@ def test_scan_and_one_frame_after_another_agree(sharp_map):
     for k, found in enumerate(founds):
         # Whole-voxel steps of the field make poses rest within a millimeter, not at one point.
         np.testing.assert_allclose(scanned.pose[k], found.pose, atol=1e-3)
-    assert int(after.updates) == int(state.updates) == int(sharp_map.updates) + 2
+    deviation = np.sqrt(np.diag(founds[3].covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(scanned.covariance[3])), deviation, rtol=0.05)
+    assert int(after.updates) == int(state.updates) == int(sharp_map.updates) + 3
     assert int(after.report.flags) == int(state.report.flags)
 
 

@@ -1,4 +1,4 @@
-"""A cloud on its way into the map: checked, brought to a fixed shape, and fused by one function."""
+"""Updates a map: checks a cloud, fixes its number of rows, and runs the stages of `stages.py`."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def run_update(
 ) -> MapState:
     """Runs the compiled update, the same one for `update` and for tracking.
 
-    Inside jit it is a call of a function of its own, which is traced once however often it is used.
+    Inside jit it is a nested call of the same compiled function, traced once per shape.
 
     Args:
         state: The map so far.

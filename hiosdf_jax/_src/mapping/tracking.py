@@ -84,7 +84,8 @@ def track(
     traced = is_traced(*jax.tree.leaves((state, prior, checked_noise, reach)))
     if traced or is_traced(cloud, predicted_pose):
         cloud, pose = as_traced(cloud, predicted_pose)
-        found = refine_pose(state, cloud, pose, prior, noise=noise)
+        chosen = _prediction(pose, reach) if prior is None else prior
+        found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach)
         found, raised = _register(state.updates, pose, found, _covariance_of(prior), reach)
         return run_update(state, cloud, found.pose, (None, checked_noise), raised), found
     padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
