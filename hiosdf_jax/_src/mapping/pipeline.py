@@ -1,4 +1,4 @@
-"""Updates a map: checks a cloud, fixes its number of rows, and runs the stages of `stages.py`."""
+"""Updates a map: checks a cloud, brings it to a fixed number of rows, runs the stages."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import MapState, check_map
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
-_TRIED_ROWS = 2000  # of a cloud that almost certainly has returns inside the bounds
+_TRIED_ROWS = 2000  # tested first; all are, if too few of these lie inside the bounds
 
-_NO_FLAG = np.uint32(0)
+_NO_FLAG = np.uint32(0)  # inside jit; outside, the number must be on the device already
 
 
 def update(
@@ -117,7 +117,7 @@ def run_update(
         cloud: (N, 3) float32. Outside jit checked, padded, and on the device.
         pose: (4, 4) float32, likewise.
         extras: `robot` and `noise`, checked.
-        raised: Flags that refuse the cloud already, () uint32.
+        raised: Flags of `Flag` that are raised before the checks, () uint32.
         donate: As for `update`.
 
     Returns:
@@ -196,7 +196,7 @@ def _pad_rows(
     if count <= capacity:
         padded[:count] = cloud
     else:
-        # The draw must be a function of the arguments, and differ from cloud to cloud.
+        # Same arguments, same rows; another cloud, other rows.
         start = 0 if pose is None else zlib.crc32(pose.tobytes())
         seed = zlib.crc32(cloud[::_HASHED_EVERY].tobytes(), start)
         rows = _draw(finite, seed, capacity)
@@ -292,7 +292,7 @@ def warn_outside(
     in_range, inside = count(cloud)
     if inside >= min_share * in_range:
         return
-    # Without numbers of this cloud: Python shows an equal message once, and not at 30 Hz.
+    # The message has no number of this cloud, so that Python shows it once, and not at 30 Hz.
     warnings.warn(
         f"cloud has less than {100 * min_share:g} % of its returns in range inside the bounds, "
         f"{bounds}: is the pose wrong, the cloud in the world frame, or the box too small? Its "
