@@ -108,7 +108,7 @@ def describe(poses, frames):
 
 
 def print_kiss_icp(stream, frames, max_range):
-    """Prints the errors of KISS-ICP's odometry, with its own default settings."""
+    """Prints the errors of KISS-ICP with its defaults for this range, without deskewing."""
     from kiss_icp.config import KISSConfig  # pyright: ignore[reportMissingImports]
     from kiss_icp.kiss_icp import KissICP  # pyright: ignore[reportMissingImports]
 

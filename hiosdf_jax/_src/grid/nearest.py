@@ -167,7 +167,7 @@ def _transform_block(
     """Does the same for an array (A, N, B) along its middle axis."""
     reach = min(horizon, squared.shape[1] - 1)
     # Otherwise XLA computes the candidates and their margins again for each shift, where it unrolls
-    # the loop. 1,024 small maps on an H100: 14 ms, and 22 ms if only the candidates are held.
+    # the loop. On an H100 the sites of 1,024 small maps take 14 ms, and 22 ms without held margins.
     squared, along = jax.lax.optimization_barrier((squared, along))
     across = hold(pad_axis(squared - along * along, 1, reach, _INFINITE).part(first, length))
     along_axis = hold(pad_axis(along, 1, reach).part(first, length))
