@@ -23,6 +23,7 @@ from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.intake import (
     as_traced,
     check_pose,
+    checked_cloud,
     cloud_and_returns,
     is_traced,
 )
@@ -172,7 +173,8 @@ def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarra
         ValueError: A shape is wrong, the pose is not finite or not rigid, or the cloud has no
             finite row.
     """
-    (cloud, finite), pose = cloud_and_returns(cloud), check_pose(pose)
+    cloud, pose = checked_cloud(cloud), check_pose(pose)
+    cloud, finite = cloud_and_returns(cloud)
     return _pad_rows(cloud, finite, capacity, pose), pose
 
 

@@ -82,19 +82,19 @@ def track(
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
     traced = is_traced(*jax.tree.leaves((state, prior, checked_noise, reach)))
-    if traced or is_traced(cloud, predicted_pose):
+    traced = traced or is_traced(cloud, predicted_pose)
+    if traced:
         cloud, pose = as_traced(cloud, predicted_pose)
-        chosen = _prediction(pose, reach) if prior is None else prior
-        found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach)
-        found, raised = _register(state.updates, pose, found, _covariance_of(prior), reach)
-        return run_update(state, cloud, found.pose, (None, checked_noise), raised), found
-    padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
+        fused_cloud, start = cloud, pose
+    else:
+        padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
+        fused_cloud, start = jax.device_put((padded, pose))
     chosen = _prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
-    found, raised = _register_jit(state.updates, jax.device_put(pose), found, own, reach)
-    cloud = jax.device_put(padded)
-    return run_update(state, cloud, found.pose, (None, checked_noise), raised, donate), found
+    found, raised = _register_jit(state.updates, start, found, own, reach)
+    extras, donate = (None, checked_noise), donate and not traced
+    return run_update(state, fused_cloud, found.pose, extras, raised, donate), found
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
