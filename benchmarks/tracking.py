@@ -4,15 +4,18 @@
     python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --poses none --kiss-icp
     python -m benchmarks.tracking --stream demo --frames 240 --poses exact drift none --kiss-icp
     python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --relocalize 100
+    python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --wrong-poses
 
 `--poses` says what is done to the stream's poses before they are refined:
 
 - `exact`, `jitter unrefined`: nothing, or as below; the poses are not refined
 - `jitter`: each is off by 2 cm and 1 degree, in random directions
 - `jitter known`: the same, and each is a prior with that standard deviation
-- `glitch`: five of them are off by 1 m
+- `glitch`, `glitch left out`: five of them are off by 1 m, or those frames are missing
 - `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
 - `none`: only the first is used
+
+`--wrong-poses` refines each third frame from poses that are 1 m off, in the map before it.
 
 `--stream demo` is the apartment; 240 frames are 10 Hz at 1 m/s. `--kiss-icp` measures the odometry
 of KISS-ICP on the same clouds beside; it needs `pip install kiss-icp`.
@@ -33,6 +36,7 @@ from benchmarks.registration import error, perturb
 from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
+from hiosdf_jax._src.mapping.tracking import REACH_M
 
 MODES = (
     "exact",
@@ -40,6 +44,7 @@ MODES = (
     "jitter",
     "jitter known",
     "glitch",
+    "glitch left out",
     "drift unrefined",
     "drift",
     "none",
@@ -47,6 +52,9 @@ MODES = (
 DRIFT = 0.01, 0.05  # of the way, degrees per meter
 JITTER = 0.02, 1.0  # m, degrees
 GLITCH = range(60, 65)
+
+# A pose is wrong if it is farther than this from the right one, m.
+WRONG_M = 0.3
 
 # A frame counts as found within this, m and degrees.
 FOUND = 0.05, 1.0
@@ -81,6 +89,9 @@ def map_stream(frames, config, mode):
     poses, refused = [], []
     for i, (cloud, _) in enumerate(frames):
         pose, fused = given[i], True
+        if mode == "glitch left out" and i in GLITCH:
+            poses.append(pose)
+            continue
         if mode == "exact" or mode.endswith("unrefined"):
             state = hio.update(state, cloud, pose)
         elif mode.startswith("jitter"):
@@ -135,6 +146,38 @@ def print_tracking(stream, frames, config, truth, mode):
         print(f"map error {scores['visible_cm']:.3f} cm")
 
 
+def print_wrong_poses(stream, frames, config):
+    """Prints how many wrong poses pass as right ones, and how many right ones are refused."""
+    state = hio.init(config, jax.random.key(0))
+    tried = by_inliers = taken = right = refused = 0
+    for i, (cloud, pose) in enumerate(frames):
+        if i >= 6 and i % 3 == 0:
+            found, near = _refine_from(state, cloud, pose)
+            right += 1
+            refused += not (near and bool(found.converged))
+            for way in ([0.6, 0.8, 0], [-0.6, -0.8, 0], [0.8, -0.6, 0], [-0.8, 0.6, 0]):
+                start = np.array(pose)
+                start[:3, 3] += way
+                found, near = _refine_from(state, cloud, start)
+                near &= np.linalg.norm(error(found.pose, pose)[:3]) >= WRONG_M
+                tried += 1
+                by_inliers += near and float(found.inliers) >= 0.7
+                taken += near and bool(found.converged)
+        state = hio.update(state, cloud, pose)
+    print(
+        f"{stream}: of {tried} poses that were 1 m off, {by_inliers} wrong ones have enough "
+        f"inliers, and {taken} are taken; of {right} right ones {refused} are refused"
+    )
+
+
+def _refine_from(state, cloud, start):
+    """Refines a pose as `track` does; returns it, and whether it is as near as `track` demands."""
+    prior = (start, (0.25 * REACH_M) ** 2 * np.eye(6, dtype=np.float32))
+    found = hio.refine_pose(state, cloud, start, prior, reach_m=REACH_M)
+    motion = error(found.pose, start)
+    return found, max(np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])) <= 2 * REACH_M
+
+
 def print_relocalization(stream, frames, state, count, up_world):
     """Finds frames in a map, and prints how many were found and those that were not."""
     rng = np.random.default_rng(0)
@@ -168,6 +211,7 @@ def main():
     parser.add_argument("--stream", type=Path, required=True, help="a recording, or demo")
     parser.add_argument("--poses", choices=MODES, nargs="*", default=[], help="see above")
     parser.add_argument("--relocalize", type=int, default=0, help="frames to find")
+    parser.add_argument("--wrong-poses", action="store_true", help="see above")
     parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
     parser.add_argument(
         "--frames", type=int, help="use only the first ones; the demo has this many"
@@ -189,6 +233,8 @@ def main():
         print_tracking(name, frames, config, truth, mode)
     if arguments.kiss_icp:
         print_kiss_icp(name, frames, max_range)
+    if arguments.wrong_poses:
+        print_wrong_poses(name, frames, config)
     if arguments.relocalize:
         if arguments.map:
             state = hio.load(arguments.map)

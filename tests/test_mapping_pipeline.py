@@ -287,8 +287,9 @@ OUT_OF_RANGE = {"far": np.full((50, 3), 30.0), "near": np.zeros((4, 3))}
 
 @pytest.mark.parametrize("cloud", OUT_OF_RANGE.values(), ids=OUT_OF_RANGE.keys())
 def test_a_cloud_out_of_range_changes_nothing_but_the_flags(room_map, cloud):
-    with pytest.warns(UserWarning, match=f"cloud has 0 of {len(cloud)} returns between"):
+    with pytest.warns(UserWarning, match=f"cloud has 0 of {len(cloud)} returns between") as caught:
         after = hio.update(room_map, cloud, np.eye(4))
+    assert caught[0].filename == __file__  # where the caller is
     flag = jnp.uint32(hio.Flag.OUT_OF_RANGE)
     report = room_map.report.replace(update_flags=flag, flags=room_map.report.flags | flag)
     assert arrays_equal(after, room_map.replace(report=report))

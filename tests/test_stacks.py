@@ -29,8 +29,8 @@ What has failed in users' stacks, and the test of it. Those without a file are i
     test_a_stack_of_maps_is_refused_with_a_word_on_vmap
     test_a_stack_of_maps_is_refused_by_update_and_bake
 - clouds of many sizes in jit(update)
-    test_posed_cloud.test_a_padded_cloud_is_what_update_maps
-    test_posed_cloud.test_pad_cloud_refuses_what_update_refuses
+    test_mapping_input.test_a_padded_cloud_is_what_update_maps
+    test_mapping_input.test_pad_cloud_refuses_what_update_refuses
 - flax to_bytes, ravel_pytree
     test_flax_writes_and_reads_a_map
     test_ravel_takes_the_float_leaves

@@ -14,7 +14,7 @@ from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.numerics.modes import pointwise
-from hiosdf_jax._src.numerics.rows import Evaluate, by_rows
+from hiosdf_jax._src.numerics.point_tiles import Evaluate, by_rows
 from hiosdf_jax._src.state import (
     Baked,
     Bound,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.mapping.registration.matching import match_points
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move
+from hiosdf_jax._src.mapping.registration.selection import even_steps
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 from hiosdf_jax._src.state import Baked, Field
 
@@ -44,6 +45,9 @@ _TRIED_DIRECTIONS = 3
 
 # Information of a free direction without a prior: a standard deviation of 100 m.
 _FREE_INFORMATION = 1e-4
+
+# Enough for coarse steps, for principal directions, and to judge a pose.
+_EVEN_ROWS = 1024
 
 # Typical ranges are limited to this, m, so that rotations keep a sensible weight.
 _RANGES_M = (0.5, 20.0)
@@ -135,6 +139,12 @@ def make_rows(points: jax.Array, some: jax.Array, noise: tuple[jax.Array, jax.Ar
 def take_rows(rows: Rows, index: jax.Array | slice) -> Rows:
     """Selects some of the rows; their typical range stays."""
     return Rows(rows.points[index], rows.sigma[index], rows.some[index], rows.length)
+
+
+def take_evenly(rows: Rows, count: int = _EVEN_ROWS) -> Rows:
+    """Selects returns at even steps, or all if there are fewer; the rows begin with the returns."""
+    count = min(count, rows.points.shape[0])
+    return take_rows(rows, even_steps(jnp.sum(rows.some), count).astype(jnp.int32))
 
 
 def units(rows: Rows) -> jax.Array:

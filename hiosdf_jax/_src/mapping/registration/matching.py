@@ -32,6 +32,12 @@ _WIDE_VOXELS = 0.22
 _FREE_VOXELS = 0.5
 _EMPTY_VOXELS = 1.5
 
+# Along each ray so many points are looked up, up to the first distance before the return. A point
+# is in a solid if it is the second distance behind a surface.
+_RAY_POINTS = 32
+_BEFORE_VOXELS = 1.5
+_SOLID_VOXELS = 1.0
+
 # The error of trilinear interpolation near surfaces, as a share of the samples' spacing.
 _BAKED_SPREAD = 0.05
 
@@ -99,6 +105,32 @@ def match_points(field: Field | Baked, points_world: jax.Array, some: jax.Array)
         spread = share * spread + (1 - share) * plane.spread
     steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
     return Match(distance, normal, spread, depth, inside & steep, empty)
+
+
+def find_blocked(
+    field: Field | Baked, pose: jax.Array, points: jax.Array, some: jax.Array
+) -> jax.Array:
+    """Finds the returns whose rays would have passed through a solid that the map knows.
+
+    Args:
+        field: The map. A baked field does not tell solids from unseen space: it blocks no ray.
+        pose: (4, 4) T_world_sensor.
+        points: (N, 3) m, sensor frame, finite.
+        some: The row is a return, (N,) bool.
+
+    Returns:
+        (N,) bool.
+    """
+    if isinstance(field, Baked):
+        return jnp.zeros_like(some)
+    voxel_size = field.config.voxel_size
+    offset = jnp.sum(points[:, None, :] * pose[:3, :3], axis=-1)
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
+    reach = jnp.maximum(1 - _BEFORE_VOXELS * voxel_size / distance, 0)
+    share = (jnp.arange(_RAY_POINTS) + 0.5) / _RAY_POINTS * reach[:, None]
+    points_world = pose[:3, 3] + offset[:, None] * share[..., None]
+    sdf = lookup.grid_sdf(field.config, field.surface, points_world)
+    return some & jnp.any(sdf < -_SOLID_VOXELS * voxel_size, axis=-1)
 
 
 def _share_of_map(width: jax.Array, usable: jax.Array) -> jax.Array:

@@ -11,13 +11,13 @@ import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, as_field
 from hiosdf_jax._src.mapping.registration.equations import (
-    INLIER_DEVIATIONS,
     Anchor,
     compare,
     make_rows,
     take_rows,
     units,
 )
+from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import (
@@ -26,7 +26,6 @@ from hiosdf_jax._src.mapping.registration.solving import (
     select_rows,
     solve_coarse,
     solve_fine,
-    take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, inflation_of
 from hiosdf_jax._src.numerics.arrays import scalar
@@ -44,11 +43,6 @@ from hiosdf_jax._src.state import Baked, Field
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384
 
-# A cloud is registered if at least this share of its returns lies where the map has observed, and
-# this share of those on its surfaces.
-_LEAST_COMPARABLE = 0.1
-_LEAST_INLIERS = 0.7
-
 
 class Registration(NamedTuple):
     """A pose that was refined by a map.
@@ -60,8 +54,8 @@ class Registration(NamedTuple):
             not determine have a standard deviation of 100 m, or that of the prior.
         residual: Root mean square distance of the inliers from the surface, () float32, m.
         inliers: Share of the returns in observed space that lie on a surface, () float32.
-        converged: The steps came to rest, and enough returns fit, () bool. Where it is False, the
-            other values must not be used.
+        converged: The steps came to rest, and the returns that fit outweigh those that contradict,
+            () bool; see docs/poses.md. Where it is False, the other values must not be used.
     """
 
     pose: jax.Array
@@ -159,22 +153,15 @@ def _refine(
         found, finished = solve_fine(still, chosen, found, directions, held, inflation, 0.0)
     covariance = covariance_of(compare(still, chosen, found, 0.0), directions, held, rows)
 
-    even = take_evenly(frozen)
-    seen = compare(still, even, found, 0.0)
-    fits = seen.comparable & (jnp.abs(seen.distance) < INLIER_DEVIATIONS * seen.sigma)
-    judged = seen.comparable | seen.contrary
-    count, comparable, total = (jnp.sum(part) for part in (fits, seen.comparable, even.some))
-    square = jnp.sum(jnp.where(fits, seen.distance**2, 0)) / jnp.maximum(count, 1)
-    inliers = count / jnp.maximum(jnp.sum(judged), 1)
-    enough = comparable >= jnp.maximum(_LEAST_COMPARABLE * total, 1)
+    verdict = judge(still, frozen, found)
     finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
     exact = differentiable(field, take_rows(rows, index), found, directions, anchor, inflation)
     return Registration(
         pose=jnp.where(finite, exact, pose),
         covariance=covariance,
-        residual=jnp.sqrt(square),
-        inliers=inliers,
-        converged=finished & enough & (inliers >= _LEAST_INLIERS) & finite,
+        residual=verdict.residual,
+        inliers=verdict.inliers,
+        converged=finished & verdict.fits & finite,
     )
 
 

@@ -20,12 +20,13 @@ from hiosdf_jax._src.mapping.registration.equations import (
     Rows,
     compare,
     make_rows,
+    take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
-from hiosdf_jax._src.mapping.registration.solving import solve_coarse, take_evenly
+from hiosdf_jax._src.mapping.registration.solving import solve_coarse
 from hiosdf_jax._src.numerics.intake import (
     as_array,
     as_key,

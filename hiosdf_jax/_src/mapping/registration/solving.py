@@ -18,17 +18,16 @@ from hiosdf_jax._src.mapping.registration.equations import (
     information_of,
     no_free_directions,
     slope_of,
-    take_rows,
+    take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.motion import move
-from hiosdf_jax._src.mapping.registration.selection import draw_informative, even_steps
+from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.state import Baked, Field
 
 # Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
 # suffice along directions in which few returns tell anything.
 _COARSE_END_M = 0.03
 _COARSE_STEPS = 24
-_COARSE_ROWS = 1024
 _DAMPING = 1e-5
 
 # So many returns tell as much as one independent one. Against a prior, coarse steps must not trust
@@ -48,12 +47,6 @@ _WHOLE_STEPS = 16  # half steps then: the distance has kinks, around which whole
 _FINE_ROWS = 2048
 _FINISHED_M = 5e-6
 _RESTING_M = 2e-3
-
-
-def take_evenly(rows: Rows, count: int = _COARSE_ROWS) -> Rows:
-    """Selects returns at even steps, or all if there are fewer; the rows begin with the returns."""
-    count = min(count, rows.points.shape[0])
-    return take_rows(rows, even_steps(jnp.sum(rows.some), count).astype(jnp.int32))
 
 
 def solve_coarse(

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hiosdf_jax._src.numerics import rows
+from hiosdf_jax._src.numerics import point_tiles
 from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.numerics.rows import by_rows
+from hiosdf_jax._src.numerics.point_tiles import by_rows
 
 FIELD = {"center": jnp.asarray([0.3, -0.2, 0.5]), "count": jnp.asarray(3)}
 POINTS = jax.random.normal(jax.random.key(0), (50, 3))
@@ -25,7 +25,7 @@ def with_gradient(field, points):
 
 @pytest.fixture(params=[False, True], ids=["plain", "with_gradient"], autouse=True)
 def tiled(request, monkeypatch):
-    monkeypatch.setattr(rows, "_LARGEST", 16)
+    monkeypatch.setattr(point_tiles, "_LARGEST", 16)
     return by_rows(distance, with_gradient if request.param else None)
 
 

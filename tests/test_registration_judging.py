@@ -1,0 +1,89 @@
+"""Whether a cloud fits a map at a pose: what a floor hides, and what walls forbid."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from room import HALF, room_cloud
+
+from hiosdf_jax._src.mapping.registration.equations import make_rows
+from hiosdf_jax._src.mapping.registration.judging import judge
+from hiosdf_jax._src.mapping.registration.matching import find_blocked
+from hiosdf_jax._src.state import field_of
+
+COUNT = 1000
+
+
+@pytest.fixture(scope="module")
+def field(sharp_map):
+    return field_of(sharp_map)
+
+
+@jax.jit
+def verdict(field, cloud, pose):
+    some = jnp.ones(len(cloud), bool)
+    return judge(field, make_rows(cloud, some, (jnp.float32(0.01), jnp.float32(0))), pose)
+
+
+def returns_of(axes, count, seed=0):
+    """Returns of a sensor in the middle of the room: on the walls across some axes alone."""
+    cloud, pose = room_cloud(seed, 40 * count)
+    kept = np.argmin(HALF - np.abs(cloud), axis=1)
+    cloud = cloud[np.isin(kept, axes)]
+    # Not near corners, where both walls are near.
+    near = np.sort(HALF - np.abs(cloud), axis=1)[:, 1]
+    return cloud[near > 0.15][:count], pose
+
+
+def shifted(pose, way):
+    result = pose.copy()
+    result[:3, 3] += way
+    return result
+
+
+def test_a_right_pose_fits_and_a_wrong_one_does_not(field):
+    cloud, pose = room_cloud(1, COUNT)
+    found = verdict(field, cloud, pose)
+    assert bool(found.fits)
+    assert float(found.inliers) > 0.95
+    assert not bool(verdict(field, cloud, shifted(pose, [0.6, 0.5, 0.3])).fits)
+
+
+@pytest.mark.parametrize("way", [-0.5, 0.5])
+def test_a_floor_does_not_outweigh_walls_that_contradict(field, way):
+    """Most returns lie on floor and ceiling, which fit wherever the sensor is."""
+    flat, pose = returns_of([2], 820)
+    ends, _ = returns_of([0], 180)
+    cloud = np.concatenate([flat, ends])
+    assert bool(verdict(field, cloud, pose).fits)
+    wrong = verdict(field, cloud, shifted(pose, [way, 0, 0]))
+    assert float(wrong.inliers) > 0.7  # a test of these alone would take the pose
+    assert not bool(wrong.fits)
+
+
+def test_a_view_of_a_floor_alone_fits(field):
+    flat, pose = returns_of([2], COUNT)
+    assert bool(verdict(field, flat, pose).fits)
+
+
+def test_things_that_are_new_leave_a_right_pose_right(field):
+    """A quarter of the walls is hidden by something in front of them."""
+    cloud, pose = room_cloud(2, COUNT)
+    hidden = cloud[:, 0] > np.quantile(cloud[:, 0], 0.75)
+    cloud[hidden] *= 0.4
+    assert bool(verdict(field, cloud, pose).fits)
+
+
+def test_rays_that_would_have_passed_walls_are_found(field):
+    cloud, pose = room_cloud(3, 200)
+    pose = shifted(pose, [0.1, -0.05, 0.05])
+    cloud = cloud - pose[:3, 3]  # now of a sensor there
+    some = np.arange(len(cloud)) >= 20
+    longer = cloud * (1 + 0.5 / np.linalg.norm(cloud, axis=1, keepdims=True))
+    shorter = cloud * 0.7
+    assert not np.any(find_blocked(field, pose, shorter, some))
+    assert not np.any(find_blocked(field, pose, cloud, some))
+    blocked = np.asarray(find_blocked(field, pose, longer, some))
+    assert not blocked[~some].any()
+    # Near corners the ray may pass the wall where no scan has looked.
+    assert blocked[some].mean() > 0.7
