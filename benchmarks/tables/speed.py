@@ -104,7 +104,7 @@ def ratios() -> str:
 
 def many() -> str:
     """Points one by one, and many small maps, on one GPU."""
-    record = records.read(records.RESULTS / "fleet_h200.json")
+    record = records.read(records.RESULTS / "speed_h200.json")
     cells = []
     for count in ("102,400", "1,048,576"):
         for function in ("sdf", "value_and_grad(sdf)"):
