@@ -36,9 +36,9 @@ def returns_of(axes, count, seed=0):
 
 
 def shifted(pose, way):
-    result = pose.copy()
+    result = np.array(pose)
     result[:3, 3] += way
-    return result
+    return jnp.asarray(result)
 
 
 def test_a_right_pose_fits_and_a_wrong_one_does_not(field):
@@ -61,9 +61,30 @@ def test_a_floor_does_not_outweigh_walls_that_contradict(field, way):
     assert not bool(wrong.fits)
 
 
-def test_a_view_of_a_floor_alone_fits(field):
+def test_rays_through_a_wall_count_where_nothing_else_contradicts(field):
+    """The end of the room would lie half a meter behind its wall, in unseen space."""
+    flat, pose = returns_of([2], 820)
+    ends, _ = returns_of([0], 1000)
+    cloud = np.concatenate([flat, ends[ends[:, 0] > 0][:180]])
+    assert bool(verdict(field, cloud, pose).fits)
+    wrong = verdict(field, cloud, shifted(pose, [0.5, 0, 0]))
+    assert float(wrong.inliers) > 0.95
+    assert not bool(wrong.fits)
+
+
+def test_a_view_of_a_floor_alone_fits_in_spite_of_outliers(field):
     flat, pose = returns_of([2], COUNT)
+    flat[:30] *= 0.5
     assert bool(verdict(field, flat, pose).fits)
+
+
+def test_rows_without_returns_change_nothing(field):
+    cloud, pose = (jnp.asarray(part) for part in room_cloud(4, 300))
+    noise = (jnp.float32(0.01), jnp.float32(0))
+    short = judge(field, make_rows(cloud, jnp.ones(300, bool), noise), pose)
+    padded = jnp.zeros((500, 3), jnp.float32).at[:300].set(cloud)
+    rows = make_rows(padded, jnp.arange(500) < 300, noise)
+    np.testing.assert_allclose(np.stack(judge(field, rows, pose)), np.stack(short), rtol=1e-6)
 
 
 def test_things_that_are_new_leave_a_right_pose_right(field):
@@ -77,13 +98,25 @@ def test_things_that_are_new_leave_a_right_pose_right(field):
 def test_rays_that_would_have_passed_walls_are_found(field):
     cloud, pose = room_cloud(3, 200)
     pose = shifted(pose, [0.1, -0.05, 0.05])
-    cloud = cloud - pose[:3, 3]  # now of a sensor there
-    some = np.arange(len(cloud)) >= 20
+    cloud = cloud - np.asarray(pose[:3, 3])  # now of a sensor there
+    some = jnp.arange(len(cloud)) >= 20
     longer = cloud * (1 + 0.5 / np.linalg.norm(cloud, axis=1, keepdims=True))
     shorter = cloud * 0.7
-    assert not np.any(find_blocked(field, pose, shorter, some))
-    assert not np.any(find_blocked(field, pose, cloud, some))
-    blocked = np.asarray(find_blocked(field, pose, longer, some))
+    assert not np.any(find_blocked(field, pose, jnp.asarray(shorter), some))
+    assert not np.any(find_blocked(field, pose, jnp.asarray(cloud), some))
+    blocked = np.asarray(find_blocked(field, pose, jnp.asarray(longer), some))
     assert not blocked[~some].any()
     # Near corners the ray may pass the wall where no scan has looked.
     assert blocked[some].mean() > 0.7
+
+
+def test_a_wall_blocks_no_ray_that_comes_from_behind(field):
+    """The next room is unseen: nobody knows how thick the wall is."""
+    cloud, pose = room_cloud(5, 200)
+    ends = cloud[np.argmin(HALF - np.abs(cloud), axis=1) == 0]
+    ends = ends[ends[:, 0] > 0]
+    for way in (0.02, 0.06):
+        behind = np.array([HALF[0] + 2.0, 0, 0], np.float32)
+        to_back = ends + np.array([way, 0, 0], np.float32) - behind
+        rays = jnp.ones(len(ends), bool)
+        assert not np.any(find_blocked(field, shifted(pose, behind), jnp.asarray(to_back), rays))

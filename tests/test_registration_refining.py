@@ -313,3 +313,13 @@ def test_wrong_input_is_named(room, change, message):
     arguments = {"field": room, "cloud": cloud, "pose": pose} | change
     with pytest.raises(ValueError, match=message):
         hio.refine_pose(**arguments)
+
+
+@pytest.mark.parametrize("x64", [False, True])
+def test_types_do_not_depend_on_the_modes_of_jax(sharp_map, x64):
+    cloud, pose = room_cloud(3, COUNT)
+    with jax.enable_x64(x64), jax.numpy_dtype_promotion("standard" if x64 else "strict"):
+        found = jax.eval_shape(lambda: hio.refine_pose(sharp_map, jnp.asarray(cloud), pose))
+        _, tracked = jax.eval_shape(lambda state: hio.track(state, cloud, pose), sharp_map)
+    for answer in (found, tracked):
+        assert [part.dtype for part in answer] == 4 * [jnp.float32] + [bool]

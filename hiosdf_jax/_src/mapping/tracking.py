@@ -139,8 +139,10 @@ def _predict_pose(pose: jax.Array, before: jax.Array, after: jax.Array) -> jax.A
     rotation = times(turn, times(back, after[:3, :3]))
     # One step toward the nearest rotation: a transpose is no inverse of a matrix that has drifted,
     # and extrapolation would more than double the drift each time.
-    rotation = times(rotation, 1.5 * jnp.eye(3) - 0.5 * times(rotation.T, rotation))
-    result = jnp.eye(4).at[:3, :3].set(rotation)
+    rotation = times(
+        rotation, 1.5 * jnp.eye(3, dtype=jnp.float32) - 0.5 * times(rotation.T, rotation)
+    )
+    result = jnp.eye(4, dtype=jnp.float32).at[:3, :3].set(rotation)
     return result.at[:3, 3].set(pose[:3, 3] + times(turn, way))
 
 
@@ -171,7 +173,7 @@ def _register(
     # A young map may have too few surfaces to register a cloud, and would never get more.
     fused = registered | (updates < CONFIDENT_UPDATES)
     if own is None:
-        own = jnp.where(first, 0, _UNKNOWN_M**2) * jnp.eye(6)
+        own = jnp.where(first, 0, _UNKNOWN_M**2) * jnp.eye(6, dtype=jnp.float32)
     chosen = found._replace(
         pose=jnp.where(registered, found.pose, predicted),
         covariance=jnp.where(registered, found.covariance, own),

@@ -149,7 +149,7 @@ def take_evenly(rows: Rows, count: int = _EVEN_ROWS) -> Rows:
 
 def units(rows: Rows) -> jax.Array:
     """Returns the meters per unit of each component of a motion, (6,)."""
-    return jnp.concatenate([jnp.ones(3), jnp.full(3, rows.length)])
+    return jnp.concatenate([jnp.ones(3, jnp.float32), jnp.full(3, rows.length, jnp.float32)])
 
 
 def compare(
@@ -249,7 +249,7 @@ def _loss(residuals: Residuals) -> jax.Array:
 
 def no_free_directions() -> Directions:
     """Returns the axes, none of them free."""
-    return Directions(jnp.eye(6), jnp.zeros(6, bool))
+    return Directions(jnp.eye(6, dtype=jnp.float32), jnp.zeros(6, bool))
 
 
 def turn(matrix: jax.Array, directions: Directions) -> jax.Array:
@@ -315,7 +315,7 @@ def find_step(
         The motion, (6,) m and rad.
     """
     information = information_of(residuals) / inflation
-    information += damping * jnp.trace(information) / 6 * jnp.eye(6)
+    information += damping * jnp.trace(information) / 6 * jnp.eye(6, dtype=jnp.float32)
     matrix = stiffness(information, directions, anchor)
     wanted = balance(directions, slope_of(residuals) / inflation, anchor, rows, pose)
     size = _sizes(matrix)

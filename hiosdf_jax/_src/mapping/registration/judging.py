@@ -2,7 +2,7 @@
 
 Floors and ceilings fit at many poses, and most returns of a wrong pose may lie in space that the
 map has not seen. So returns that fit count by how much their normals differ, and rays that would
-have passed through known solids count against a pose.
+have entered known solids count against a pose.
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ _LEAST_COMPARABLE = 0.1
 _LEAST_INLIERS = 0.7
 
 # Returns that fit count by how much their normals differ: 0 on one plane, 0.42 if they point
-# everywhere. Together with an allowance, a share of all returns that stands for noise, they must
-# outweigh what contradicts the pose by 3 to 7. Of 158 wrong poses in recorded streams that pass the
-# other tests (`python -m benchmarks.tracking --wrong-poses`), 155 fail this one. No right pose
-# does; the least share of one was 0.31.
+# everywhere. Together with an allowance, a share of all returns that stands for noise, they are the
+# support of a pose. It must be at least this share of the sum of support and contradiction.
 _LEAST_SHARE = 0.3
 _ALLOWANCE = 0.02
 
@@ -80,7 +78,7 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
     contrary = jnp.sum(judged & ~on_surface) + blocked_share * total
     supporting = variety * inliers + _ALLOWANCE * total
 
-    share = inliers / jnp.maximum(jnp.sum(judged), 1)
+    share = inliers.astype(jnp.float32) / jnp.maximum(jnp.sum(judged), 1).astype(jnp.float32)
     fits = comparable >= jnp.maximum(_LEAST_COMPARABLE * total, 1)
     fits &= share >= _LEAST_INLIERS
     fits &= supporting >= _LEAST_SHARE * (supporting + contrary)

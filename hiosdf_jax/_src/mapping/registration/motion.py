@@ -61,7 +61,11 @@ def rotation_of(vector: jax.Array) -> jax.Array:
     x, y, z = vector
     zero = jnp.zeros_like(x)
     across = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return jnp.eye(3) + first * across + second * jnp.matmul(across, across, precision="highest")
+    return (
+        jnp.eye(3, dtype=jnp.float32)
+        + first * across
+        + second * jnp.matmul(across, across, precision="highest")
+    )
 
 
 def vector_of(rotation: jax.Array) -> jax.Array:

@@ -37,6 +37,7 @@ from hiosdf_jax._src.numerics.intake import (
     cloud_and_returns,
     is_traced,
 )
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import Baked, Field
 
@@ -54,8 +55,8 @@ class Registration(NamedTuple):
             not determine have a standard deviation of 100 m, or that of the prior.
         residual: Root mean square distance of the inliers from the surface, () float32, m.
         inliers: Share of the returns in observed space that lie on a surface, () float32.
-        converged: The steps came to rest, and the returns that fit outweigh those that contradict,
-            () bool; see docs/poses.md. Where it is False, the other values must not be used.
+        converged: The steps came to rest, and enough returns support the pose, () bool; see
+            docs/poses.md. Where it is False, the other values must not be used.
     """
 
     pose: jax.Array
@@ -120,6 +121,7 @@ def refine_pose(
     return _refine_jit(field, padded, check_pose(pose), prior, checked_noise, reach)
 
 
+@plain
 def _refine(
     field: Field | Baked,
     cloud: jax.Array,
@@ -131,6 +133,9 @@ def _refine(
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
+    if isinstance(field, Field):  # nearer rows are no returns for `update`, either
+        near = jnp.sum(cloud**2, axis=-1) < field.config.min_range**2
+        cloud = jnp.where(near[:, None], jnp.nan, cloud)
     points, some = draw_evenly(cloud, _CANDIDATES)
     floor, growth = noise_of(field) if noise is None else noise
     rows = make_rows(points, some, (jnp.float32(floor), jnp.float32(growth)))

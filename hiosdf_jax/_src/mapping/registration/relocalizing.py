@@ -119,7 +119,7 @@ def relocalize(
     ups = [_direction("up_sensor", up_sensor), _direction("up_world", up_world)]
     traced = is_traced(*jax.tree.leaves((field, key)), cloud, *ups)
     if traced:
-        cloud, _ = as_traced(cloud, jnp.eye(4))
+        cloud, _ = as_traced(cloud, jnp.eye(4, dtype=jnp.float32))
     else:
         cloud, _ = cloud_and_returns(cloud)
     points, some = _draw(cloud)
@@ -173,7 +173,7 @@ def _find_places(
 
     def pose_of(position: jax.Array, angle: jax.Array) -> jax.Array:
         turn = jnp.matmul(rotation_of(angle * up), level, precision="highest")
-        return jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(position)
+        return jnp.eye(4, dtype=jnp.float32).at[:3, :3].set(turn).at[:3, 3].set(position)
 
     few, few_some = draw_evenly(jnp.where(some[:, None], points, jnp.nan), _FEW_ROWS)
     costs = _costs(cells)
@@ -274,7 +274,7 @@ def _turn_onto(start: jax.Array, end: jax.Array) -> jax.Array:
     cosine = jnp.sum(start * end)
     axis = jnp.cross(start, end)
     # Opposite vectors: half a turn about any axis across them.
-    across = jnp.cross(start, jnp.eye(3)[jnp.argmin(jnp.abs(start))])
+    across = jnp.cross(start, jnp.eye(3, dtype=jnp.float32)[jnp.argmin(jnp.abs(start))])
     opposite = cosine < -0.9999
     axis = jnp.where(opposite, across, axis)
     sine = jnp.linalg.norm(axis)

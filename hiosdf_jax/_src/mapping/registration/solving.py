@@ -70,7 +70,7 @@ def solve_coarse(
     axes = no_free_directions()
 
     def step(i: jax.Array, pose: jax.Array) -> jax.Array:
-        scale_m = reach_m * shrink ** (i / (_COARSE_STEPS - 1))
+        scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         residuals = compare(field, few, pose, scale_m)
         motion = find_step(residuals, axes, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
         return move(pose, motion)
@@ -99,7 +99,7 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
     # Free directions must not draw all rows.
     held = jnp.where(directions.free, jnp.trace(information), 0)
     information += (directions.basis * held) @ directions.basis.T
-    information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6)
+    information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6, dtype=jnp.float32)
     row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
     # A small cloud that is padded gives the same pose as without padding.
     return jnp.where(jnp.sum(rows.some) <= _FINE_ROWS, whole, row), directions
@@ -130,7 +130,7 @@ def solve_fine(
     """
 
     def tolerance(count: jax.Array) -> jax.Array:
-        scale_m = start_m * _FINE_SHRINK**count
+        scale_m = start_m * _FINE_SHRINK ** count.astype(jnp.float32)
         return jnp.where(scale_m > _FINE_END_M, scale_m, 0)
 
     def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
@@ -138,7 +138,7 @@ def solve_fine(
         residuals = compare(field, rows, pose, tolerance(count))
         motion = find_step(residuals, directions, anchor, rows, pose, inflation)
         way = jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
-        motion = jnp.where(count < _WHOLE_STEPS, 1, 0.5) * motion
+        motion = jnp.where(count < _WHOLE_STEPS, motion, 0.5 * motion)
         return move(pose, motion), way, count + 1
 
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
@@ -183,7 +183,7 @@ def differentiable(
         return balance(directions, slope, anchor, rows, moved)
 
     def solve_linear(linear: Callable, value: jax.Array) -> jax.Array:
-        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(6))
+        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(6, dtype=jnp.float32))
         # Rows of free directions are many orders smaller than others.
         size = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-12)
         return jnp.linalg.solve(size[:, None] * matrix, size * value)
@@ -191,5 +191,5 @@ def differentiable(
     def stay(_: Callable, start: jax.Array) -> jax.Array:
         return start
 
-    motion = jax.lax.custom_root(unbalance, jnp.zeros(6), stay, solve_linear)
+    motion = jax.lax.custom_root(unbalance, jnp.zeros(6, jnp.float32), stay, solve_linear)
     return move(pose, motion)

@@ -34,7 +34,7 @@ def spread_of_slope(residuals: Residuals) -> jax.Array:
     total = sum_in_cells(values, residuals.points_world, _CELL_M)
     part, count = total[:, :6], jnp.sum(total[:, 6] > 0)
     # Six numbers were fitted to the sums.
-    share = count / jnp.maximum(count - 6, 1)
+    share = jnp.float32(count) / jnp.maximum(count - 6, 1).astype(jnp.float32)
     return share * jnp.matmul(part.T, part, precision="highest")
 
 
@@ -60,7 +60,7 @@ def covariance_of(
     Returns:
         (6, 6) m and rad. A free direction without a prior has a standard deviation of 100 m.
     """
-    free = jnp.diag(jnp.where(directions.free, 1.0, 0.0))
+    free = jnp.diag(directions.free.astype(jnp.float32))
     inverse = invert(turn(information_of(residuals), directions) + free) - free
     # At least that of independent returns: a few cells may agree by chance.
     own = inverse @ turn(spread_of_slope(residuals), directions) @ inverse + inverse
