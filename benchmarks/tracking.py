@@ -36,7 +36,9 @@ from benchmarks.registration import error, perturb
 from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.mapping.tracking import REACH_M
+from hiosdf_jax._src.mapping.registration.judging import LEAST_INLIERS
+from hiosdf_jax._src.mapping.registration.motion import way_and_angle
+from hiosdf_jax._src.mapping.tracking import MOST_MOVED, REACH_M, prior_of_prediction
 
 MODES = (
     "exact",
@@ -161,7 +163,7 @@ def print_wrong_poses(stream, frames, config):
                 found, near = _refine_from(state, cloud, start)
                 near &= np.linalg.norm(error(found.pose, pose)[:3]) >= WRONG_M
                 tried += 1
-                by_inliers += near and float(found.inliers) >= 0.7
+                by_inliers += near and float(found.inliers) >= LEAST_INLIERS
                 taken += near and bool(found.converged)
         state = hio.update(state, cloud, pose)
     print(
@@ -172,10 +174,9 @@ def print_wrong_poses(stream, frames, config):
 
 def _refine_from(state, cloud, start):
     """Refines a pose as `track` does; returns it, and whether it is as near as `track` demands."""
-    prior = (start, (0.25 * REACH_M) ** 2 * np.eye(6, dtype=np.float32))
+    prior = prior_of_prediction(start, REACH_M)
     found = hio.refine_pose(state, cloud, start, prior, reach_m=REACH_M)
-    motion = error(found.pose, start)
-    return found, max(np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])) <= 2 * REACH_M
+    return found, max(way_and_angle(found.pose, start)) <= MOST_MOVED * REACH_M
 
 
 def print_relocalization(stream, frames, state, count, up_world):

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import itertools
 import os
-import shlex
 import signal
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hiosdf_jax._src.command.arguments import DEMO_FRAMES, parser_of
-from hiosdf_jax._src.command.console import LastingText, lasting
+from hiosdf_jax._src.command.console import begin, check_console, lasting
 from hiosdf_jax._src.command.failures import (
     BAD_INPUT,
-    NOTHING_MAPPED,
-    SKIP_HINT,
     Failure,
     checked,
     message_of,
@@ -34,19 +29,14 @@ from hiosdf_jax._src.command.inputs import (
     seed_of,
 )
 from hiosdf_jax._src.command.outputs import check_folder, check_outputs, is_map
+from hiosdf_jax._src.command.run import run_mapping
 from hiosdf_jax._src.command.stopping import Stopping
+from hiosdf_jax._src.command.watching import wait_for_signal
 from hiosdf_jax._src.output_files import check_output, replacing_together
 
 # Heavy imports are inside the functions, so that `hiosdf --help` responds at once.
 if TYPE_CHECKING:
-    import numpy as np
-
-    from hiosdf_jax._src.command.live_map import LiveMap
-    from hiosdf_jax._src.command.progress import SavedMap
     from hiosdf_jax._src.command.tracker import Tracker
-    from hiosdf_jax._src.config import Config
-    from hiosdf_jax._src.datasets.stream import Stream
-    from hiosdf_jax._src.datasets.truth import GroundTruth
 
 _NOT_REACHED = 1  # exit code
 _OUTPUT = Path("hiosdf_output")
@@ -76,10 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with lasting() as out, Stopping() as stopping:
         options.stopping = stopping
         try:
-            _check_console(out)
+            check_console(out)
             _check_numbers(options)
             options.command(options)
-            _check_console(out)
+            check_console(out)
         except Failure as failure:
             print(f"hiosdf: {failure}", file=sys.stderr)
             return failure.code
@@ -97,15 +87,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if stopping.received is None else 128 + stopping.received
 
 
-def _check_console(out: Any) -> None:
-    """Raises a failure if standard output is closed, or its reader has gone."""
-    if out is None:
-        raise Failure("standard output is closed", BAD_INPUT)
-    out.flush()
-    if isinstance(out, LastingText) and out.failure is not None:
-        raise Failure(f"standard output: {out.failure.strerror}", BAD_INPUT)
-
-
 def _check_numbers(options: argparse.Namespace) -> None:
     """Raises a failure for numbers too large to count with."""
     most = {"seed": _MOST_SEED, "port": _MOST_PORT}
@@ -115,12 +96,6 @@ def _check_numbers(options: argparse.Namespace) -> None:
         value = getattr(options, name, None)
         if value is not None and value > limit:
             raise Failure(f"--{name} is {value}, expected at most {limit}", BAD_INPUT)
-
-
-def _begin(text: str) -> None:
-    """Prints the first line of a run; fails, before any work, if nobody can read it."""
-    print(text)
-    _check_console(sys.stdout)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -140,8 +115,8 @@ def _demo(options: argparse.Namespace) -> None:
         config = configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)
     else:
         config = resumed.state.config
-    _begin(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
-    _run(
+    begin(f"{len(stream)} frames of a depth camera carried through a furnished apartment")
+    run_mapping(
         options,
         stream,
         config,
@@ -172,7 +147,7 @@ def _plan(options: argparse.Namespace) -> None:
         hint = f"--plan needs {package}: in a clone, pip install '.[plan]'"
         raise Failure(hint, BAD_INPUT) from error
 
-    _begin("a robot explores an apartment that it does not know")
+    begin("a robot explores an apartment that it does not know")
     run = exploration.explore(options.seed or 0)
     print("drawing plan.png and plan.gif")
     with replacing_together(output, _PLAN_RESULTS) as folder:
@@ -208,7 +183,7 @@ def _map(options: argparse.Namespace) -> None:
     configure(options.config, bounds or ((0, 0, 0), (10, 10, 10)), **overrides)
     resumed = resumed_map(options)
     stream, truth = open_inputs(options)
-    _begin(f"{place.name}: {len(stream)} frames")
+    begin(f"{place.name}: {len(stream)} frames")
     if resumed is not None:
         config = resumed.state.config
     else:
@@ -218,7 +193,7 @@ def _map(options: argparse.Namespace) -> None:
     exact_sdf = None
     if options.ground_truth is not None:
         truth, exact_sdf = sample_truth(options.ground_truth, stream, config.max_range)
-    _run(
+    run_mapping(
         options,
         stream,
         config,
@@ -256,18 +231,8 @@ def _view(options: argparse.Namespace) -> None:
         checked(lambda: viewer.export(options.export))
         print(f"wrote {options.export}")
     else:
-        _wait(options, viewer.url)
+        wait_for_signal(options.stopping, viewer.url)
     viewer.close()
-
-
-def _wait(options: argparse.Namespace, url: str) -> None:
-    """Lets a view live until a signal; Ctrl-C is its usual end."""
-    options.stopping.in_order()
-    print(f"the view is at {url} until Ctrl-C", flush=True)
-    while options.stopping.received is None:
-        time.sleep(0.1)
-    if options.stopping.received == signal.SIGINT:
-        options.stopping.received = None
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -349,114 +314,12 @@ def _bench(options: argparse.Namespace) -> None:
 
     stream = apartment.ApartmentStream(frames=bench.FRAMES)
     config = configure(options.config, apartment.BOUNDS_WORLD, max_range=stream.max_range)
-    _begin("updates and queries of a map of the demo's apartment, about a minute on two CPU cores")
+    begin("updates and queries of a map of the demo's apartment, about a minute on two CPU cores")
     record = bench.measure(stream, config)
     print(bench.format_record(record))
     if options.json is not None:
         write_json(options.json, record)
         print(f"\nwrote {options.json}")
-
-
-def _run(
-    options: argparse.Namespace,
-    stream: Stream,
-    config: Config,
-    output: Path,
-    *,
-    truth: GroundTruth | None,
-    resumed: SavedMap | None,
-    **settings: Any,
-) -> None:
-    """Maps, scores and draws; turns what ends the mapping into a failure or a hint to go on."""
-    from hiosdf_jax._src.command import map_stream
-    from hiosdf_jax._src.command.map_frames import (
-        NothingMappedError,
-        OtherStreamError,
-        StoppedError,
-    )
-    from hiosdf_jax._src.datasets.stream import BadFrameError
-
-    if truth is not None and not (truth.frame < len(stream)).any():
-        first = f"begin with frame {truth.frame.min()}" if len(truth.frame) else "are none"
-        raise Failure(
-            f"the exact distances {first}, but the stream has {len(stream)} frames", BAD_INPUT
-        )
-    if resumed is not None and resumed.held_out != (truth is None):
-        was = "without" if resumed.held_out else "with"
-        raise Failure(f"{options.resume} was mapped {was} exact distances", BAD_INPUT)
-    live = _watch(options, stream, settings["exact_sdf"], output)
-    options.stopping.in_order()
-    try:
-        map_stream.run_stream(
-            stream,
-            config,
-            output,
-            truth=truth,
-            resumed=resumed,
-            resume_path=options.resume,
-            save_path=options.save,
-            checkpoint_every=options.checkpoint_every,
-            stop=lambda: options.stopping.received and options.stopping.received.name,
-            live=live,
-            **settings,
-        )
-    except BadFrameError as error:
-        raise Failure(f"{error}{SKIP_HINT}", BAD_INPUT) from error
-    except NothingMappedError as error:
-        raise Failure(error, NOTHING_MAPPED) from error
-    except OtherStreamError as error:
-        raise Failure(f"{options.resume}: {error}", BAD_INPUT) from error
-    except StoppedError as stop:
-        if not stop.mapped:
-            raise KeyboardInterrupt from stop
-        if settings.get("tracker") is not None:
-            print(f"stopped by {stop}")
-        else:
-            map_path = str(map_stream.map_file(output, options.save))
-            command, *rest = _without_resume(options.arguments)
-            again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
-            print(f"stopped by {stop}; to go on:\n  {again}")
-    if live is not None:
-        _end_watch(options, live)
-
-
-def _watch(
-    options: argparse.Namespace,
-    stream: Stream,
-    exact_sdf: Callable[[np.ndarray], np.ndarray] | None,
-    output: Path,
-) -> LiveMap | None:
-    """Starts the view of a growing map, if there is to be one."""
-    if not options.view and options.export is None:
-        return None
-    from hiosdf_jax._src.command.live_map import LiveMap
-
-    port = options.port if options.view else 0
-    button = options.export or output / "scene.html"
-    live = checked(lambda: LiveMap(stream, exact_sdf, options.host, port, button))
-    if options.view:
-        print(f"the map grows at {live.url}", flush=True)
-    return live
-
-
-def _end_watch(options: argparse.Namespace, live: LiveMap) -> None:
-    """Writes the view if it is to be written, and lets it live on if it is watched."""
-    if options.export is not None:
-        checked(lambda: live.export(options.export))
-        print(f"wrote {options.export}")
-    if options.view and options.stopping.received is None:
-        _wait(options, live.url)
-    live.close()
-
-
-def _without_resume(arguments: Sequence[str]) -> list[str]:
-    """The arguments without the option --resume and its value."""
-    kept = []
-    names = itertools.takewhile(lambda argument: argument != "--", arguments)
-    for argument, before in zip(names, ["", *arguments], strict=False):
-        if "--resume" not in (argument, before) and not argument.startswith("--resume="):
-            kept.append(argument)
-    return kept + list(itertools.dropwhile(lambda argument: argument != "--", arguments))
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any, TextIO
 
+from hiosdf_jax._src.command.failures import BAD_INPUT, Failure
+
 
 class LastingText:
     """A text stream that notes a failure to write and goes on without writing.
@@ -63,6 +65,21 @@ def lasting() -> Iterator[LastingText | None]:
             each.flush()
             if each.failure is not None:
                 _silence(each)
+
+
+def check_console(out: Any) -> None:
+    """Raises a failure if standard output is closed, or its reader has gone."""
+    if out is None:
+        raise Failure("standard output is closed", BAD_INPUT)
+    out.flush()
+    if isinstance(out, LastingText) and out.failure is not None:
+        raise Failure(f"standard output: {out.failure.strerror}", BAD_INPUT)
+
+
+def begin(text: str) -> None:
+    """Prints the first line of a run; fails, before any work, if nobody can read it."""
+    print(text)
+    check_console(sys.stdout)
 
 
 def _silence(stream: LastingText) -> None:

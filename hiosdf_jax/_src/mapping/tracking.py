@@ -25,10 +25,11 @@ from hiosdf_jax._src.state import Flag, MapState, check_map
 REACH_M = 0.2
 """How far surfaces may be from where they should be, by default."""
 
-# Without a prior the prediction is one, whose standard deviation is this share of `reach_m`, m and
-# rad. A cloud is not registered if its pose was moved by more than the other share.
+MOST_MOVED = 2.0
+"""How far a pose may be moved from its prediction, as a share of `reach_m`, m and rad."""
+
+# The standard deviation of a prediction without a prior, as a share of `reach_m`, m and rad.
 _PREDICTED_DEVIATION = 0.25
-_MOST_MOVED = 2.0
 
 _UNKNOWN_M = 100.0  # standard deviation of a pose of which nothing is known, m and rad
 
@@ -89,7 +90,7 @@ def track(
     else:
         padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
         fused_cloud, start = jax.device_put((padded, pose))
-    chosen = _prediction(pose, reach) if prior is None else prior
+    chosen = prior_of_prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
     found, raised = _register_jit(state.updates, start, found, own, reach)
@@ -149,8 +150,8 @@ def _predict_pose(pose: jax.Array, before: jax.Array, after: jax.Array) -> jax.A
 _predict_pose_jit = jax.jit(_predict_pose)
 
 
-def _prediction(pose: Any, reach_m: jax.Array) -> tuple[Any, Any]:
-    """The prior that a prediction is where none is given."""
+def prior_of_prediction(pose: Any, reach_m: jax.Array | float) -> tuple[Any, Any]:
+    """Returns the prior of a predicted pose that is given without one: its mean and covariance."""
     return pose, (_PREDICTED_DEVIATION * reach_m) ** 2 * jnp.eye(6, dtype=jnp.float32)
 
 
@@ -168,7 +169,7 @@ def _register(
 ) -> tuple[Registration, jax.Array]:
     """Decides whether a cloud is fused, and where; also returns the flags that this raises."""
     first = updates == 0
-    near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= _MOST_MOVED * reach_m
+    near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
     registered = found.converged & near & ~first
     # A young map may have too few surfaces to register a cloud, and would never get more.
     fused = registered | (updates < CONFIDENT_UPDATES)

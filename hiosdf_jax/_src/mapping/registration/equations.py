@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.mapping.registration.matching import match_points
-from hiosdf_jax._src.mapping.registration.motion import motion_between, move
+from hiosdf_jax._src.mapping.registration.motion import motion_between, move, offsets_from
 from hiosdf_jax._src.mapping.registration.selection import even_steps
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 from hiosdf_jax._src.state import Baked, Field
@@ -166,7 +166,7 @@ def compare(
     Returns:
         The residuals.
     """
-    offset = jnp.sum(rows.points[:, None, :] * pose[:3, :3], axis=-1)
+    offset = offsets_from(pose, rows.points)
     points_world = offset + pose[:3, 3]
     match = match_points(field, points_world, rows.some)
     # Only the part of the error along the normal counts.

@@ -21,10 +21,10 @@ from hiosdf_jax._src.mapping.registration.equations import (
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
 from hiosdf_jax._src.state import Baked, Field
 
-# At least this share of the returns must lie where the map has observed, and this share of those on
-# its surfaces.
-_LEAST_COMPARABLE = 0.1
-_LEAST_INLIERS = 0.7
+_LEAST_COMPARABLE = 0.1  # share of the returns that must lie where the map has observed
+
+LEAST_INLIERS = 0.7
+"""Share of the returns in observed space that must lie on its surfaces."""
 
 # Returns that fit count by how much their normals differ: 0 on one plane, 0.42 if they point
 # everywhere. Together with an allowance, a share of all returns that stands for noise, they are the
@@ -80,6 +80,6 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
 
     share = inliers.astype(jnp.float32) / jnp.maximum(jnp.sum(judged), 1).astype(jnp.float32)
     fits = comparable >= jnp.maximum(_LEAST_COMPARABLE * total, 1)
-    fits &= share >= _LEAST_INLIERS
+    fits &= share >= LEAST_INLIERS
     fits &= supporting >= _LEAST_SHARE * (supporting + contrary)
     return Verdict(jnp.sqrt(square), share, fits)

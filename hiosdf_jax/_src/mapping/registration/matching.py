@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.field.points import query
 from hiosdf_jax._src.grid import geometry, lookup
+from hiosdf_jax._src.mapping.registration.motion import offsets_from
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state import Baked, Field
 
@@ -33,9 +34,9 @@ _WIDE_VOXELS = 0.22
 _FREE_VOXELS = 0.5
 _EMPTY_VOXELS = 1.5
 
-# Along each ray so many points are looked up, up to the first distance before the return. A point
-# is in a solid if it is the second distance behind a surface. One voxel before, the distance is
-# larger by less than the third, unless the ray comes from behind.
+# This many points of each ray are looked up. The last one is the first distance before the return.
+# A point is in a solid if it is the second distance behind a surface. One voxel nearer to the
+# sensor the signed distance is larger, by less than the third, unless the ray comes from behind.
 _RAY_POINTS = 32
 _BEFORE_VOXELS = 1.5
 _SOLID_VOXELS = 1.0
@@ -127,7 +128,7 @@ def find_blocked(
     if isinstance(field, Baked):
         return jnp.zeros_like(some)
     voxel_size = field.config.voxel_size
-    offset = jnp.sum(points[:, None, :] * pose[:3, :3], axis=-1)
+    offset = offsets_from(pose, points)
     distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
     reach = jnp.maximum(1 - _BEFORE_VOXELS * voxel_size / distance, 0)
     share = (jnp.arange(_RAY_POINTS, dtype=jnp.float32) + 0.5) / _RAY_POINTS * reach[:, None]

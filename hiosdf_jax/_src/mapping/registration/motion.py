@@ -26,6 +26,19 @@ def move(pose: jax.Array, motion: jax.Array) -> jax.Array:
     return jnp.asarray(pose).at[:3, :3].set(rotation).at[:3, 3].add(motion[:3])
 
 
+def offsets_from(pose: jax.Array, points: jax.Array) -> jax.Array:
+    """Turns points of the sensor frame to the axes of the world, relative to the sensor.
+
+    Args:
+        pose: (4, 4) T_world_sensor.
+        points: (N, 3) m, sensor frame.
+
+    Returns:
+        (N, 3) m. Exact float32 sums, where a GPU's product of matrices may round to fewer bits.
+    """
+    return jnp.sum(points[:, None, :] * pose[:3, :3], axis=-1)
+
+
 def motion_between(first: jax.Array, second: jax.Array) -> jax.Array:
     """Computes the motion that leads from one pose to another.
 

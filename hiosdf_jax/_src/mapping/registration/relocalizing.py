@@ -23,7 +23,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.matching import noise_of
-from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import offsets_from, rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import solve_coarse
@@ -283,7 +283,7 @@ def _turn_onto(start: jax.Array, end: jax.Array) -> jax.Array:
 
 
 def _place(pose: jax.Array, points: jax.Array) -> jax.Array:
-    return jnp.sum(points[:, None, :] * pose[:3, :3], axis=-1) + pose[:3, 3]
+    return offsets_from(pose, points) + pose[:3, 3]
 
 
 def _rows(field: Field | Baked, points: jax.Array, some: jax.Array) -> Rows:

@@ -135,7 +135,7 @@ def write_costmap(path: str | os.PathLike[str], grid: Costmap) -> None:
 
 
 def _within(mask: np.ndarray, cells: float) -> np.ndarray:
-    """The cells whose centers are at most so many cells from one of a mask."""
+    """The cells whose centers are within a distance, in cells, of the centers of a mask."""
     from scipy.ndimage import distance_transform_edt
 
     if not mask.any():
@@ -144,6 +144,6 @@ def _within(mask: np.ndarray, cells: float) -> np.ndarray:
 
 
 def _within_of_edge(shape: tuple[int, ...], cells: float) -> np.ndarray:
-    """The cells that are at most so many cells from what lies beyond the map."""
+    """The cells within a distance, in cells, of the outside of the map."""
     steps = [np.minimum(np.arange(count) + 1, np.arange(count, 0, -1)) for count in shape]
     return np.minimum(steps[0][:, None], steps[1][None]) <= cells
