@@ -11,6 +11,7 @@
 - `exact`, `jitter unrefined`: nothing, or as below; the poses are not refined
 - `jitter`: each is off by 2 cm and 1 degree, in random directions
 - `jitter known`: the same, and each is a prior with that standard deviation
+- `jitter smoothed`: the same, smoothed afterwards with that deviation, and mapped again three times
 - `glitch`, `glitch left out`: five of them are off by 1 m, or those frames are missing
 - `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
 - `none`: only the first is used
@@ -45,6 +46,7 @@ MODES = (
     "jitter unrefined",
     "jitter",
     "jitter known",
+    "jitter smoothed",
     "glitch",
     "glitch left out",
     "drift unrefined",
@@ -53,6 +55,8 @@ MODES = (
 )
 DRIFT = 0.01, 0.05  # of the way, degrees per meter
 JITTER = 0.02, 1.0  # m, degrees
+JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 2 / 3)
+MAPPED_AGAIN = 3
 GLITCH = range(60, 65)
 
 # A pose is wrong if it is farther than this from the right one, m.
@@ -62,11 +66,11 @@ WRONG_M = 0.3
 FOUND = 0.05, 1.0
 
 
-def change(exact, mode):
+def change(exact, mode, seed=0):
     """Returns the poses that a stream has, made worse."""
     given = [np.array(pose) for pose in exact]
     if mode.startswith("jitter"):
-        rng = np.random.default_rng(0)
+        rng = np.random.default_rng(seed)
         given[1:] = [perturb(pose, rng, *JITTER) for pose in exact[1:]]
     if mode == "glitch":
         for i in GLITCH:
@@ -81,11 +85,9 @@ def change(exact, mode):
     return given
 
 
-def map_stream(frames, config, mode):
+def map_stream(frames, config, mode, seed=0):
     """Maps frames; returns the map, the poses at which they were fused, and who was refused."""
-    given = change([pose for _, pose in frames], mode)
-    deviation = np.repeat([JITTER[0], np.radians(JITTER[1])], 3) / 3**0.5
-    prior = np.diag(deviation**2).astype(np.float32)
+    given = change([pose for _, pose in frames], mode, seed)
     tracker = Tracker(odometry=mode == "none")
     state = hio.init(config, jax.random.key(0))
     poses, refused = [], []
@@ -97,7 +99,7 @@ def map_stream(frames, config, mode):
         if mode == "exact" or mode.endswith("unrefined"):
             state = hio.update(state, cloud, pose)
         elif mode.startswith("jitter"):
-            known = (pose, prior) if mode == "jitter known" else None
+            known = (pose, JITTER_COVARIANCE) if mode == "jitter known" else None
             state, found = hio.track(state, cloud, pose, known)
             pose, fused = found.pose, bool(found.converged)
         else:
@@ -106,7 +108,27 @@ def map_stream(frames, config, mode):
         poses.append(np.asarray(pose))
         if not fused:
             refused.append(i)
+    if mode == "jitter smoothed":
+        state, poses = map_again(frames, config, given, poses, refused)
     return state, poses, refused
+
+
+def map_again(frames, config, given, poses, refused):
+    """Maps frames at smoothed poses, and registers them in that map; returns map and poses."""
+    registered = ~np.isin(np.arange(len(frames)), refused)
+    for time_left in reversed(range(MAPPED_AGAIN)):
+        poses = hio.smooth_poses(poses, given, JITTER_COVARIANCE, registered)
+        state = hio.init(config, jax.random.key(0))
+        for (cloud, _), pose in zip(frames, poses, strict=True):
+            state = hio.update(state, cloud, pose)
+        if time_left:
+            found = [
+                hio.refine_pose(state, cloud, pose)
+                for (cloud, _), pose in zip(frames, poses, strict=True)
+            ]
+            poses = [np.asarray(each.pose) for each in found]
+            registered = np.array([bool(each.converged) for each in found])
+    return state, list(poses)
 
 
 def describe(poses, frames):
@@ -136,10 +158,10 @@ def print_kiss_icp(stream, frames, max_range):
     print(f"{stream}, KISS-ICP: {describe(poses, frames)}; {time.perf_counter() - begin:.0f} s")
 
 
-def print_tracking(stream, frames, config, truth, mode):
+def print_tracking(stream, frames, config, truth, mode, seed):
     """Maps a stream and prints the errors of the poses and of the map."""
     begin = time.perf_counter()
-    state, poses, refused = map_stream(frames, config, mode)
+    state, poses, refused = map_stream(frames, config, mode, seed)
     print(f"{stream}, {mode}: {describe(poses, frames)}; not registered: {refused}; ", end="")
     print(f"{time.perf_counter() - begin:.0f} s", flush=True)
     if truth is not None:
@@ -211,6 +233,7 @@ def main():
     parser = argparse.ArgumentParser(description="Tracks streams and relocalizes frames.")
     parser.add_argument("--stream", type=Path, required=True, help="a recording, or demo")
     parser.add_argument("--poses", choices=MODES, nargs="*", default=[], help="see above")
+    parser.add_argument("--seed", type=int, default=0, help="of the jitter")
     parser.add_argument("--relocalize", type=int, default=0, help="frames to find")
     parser.add_argument("--wrong-poses", action="store_true", help="see above")
     parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
@@ -231,7 +254,7 @@ def main():
     frames = [stream[i] for i in range(arguments.frames or len(stream))]
     name = arguments.stream.stem
     for mode in arguments.poses:
-        print_tracking(name, frames, config, truth, mode)
+        print_tracking(name, frames, config, truth, mode, arguments.seed)
     if arguments.kiss_icp:
         print_kiss_icp(name, frames, max_range)
     if arguments.wrong_poses:

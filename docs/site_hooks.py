@@ -18,7 +18,14 @@ _PAGES = {
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     **{
         f"notebooks/{name}.md": f"notebooks/{name}.ipynb"
-        for name in ("quickstart", "inside_the_method", "planning", "own_data", "thousand_maps")
+        for name in (
+            "quickstart",
+            "inside_the_method",
+            "planning",
+            "own_data",
+            "poses",
+            "thousand_maps",
+        )
     },
 }
 _MODULES = ("planning", "datasets", "exports", "pictures", "scoring", "demo")

@@ -20,6 +20,7 @@ from hiosdf_jax._src.mapping.moving import moving_rows
 from hiosdf_jax._src.mapping.pipeline import pad_cloud, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
+from hiosdf_jax._src.mapping.registration.smoothing import smooth_poses
 from hiosdf_jax._src.mapping.tracking import predict_pose, track
 from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
 from hiosdf_jax._src.view.live import Viewer, view
@@ -63,6 +64,7 @@ __all__ = [
     "save",
     "sdf",
     "sdf_and_grad",
+    "smooth_poses",
     "snapshot",
     "track",
     "transform",

@@ -13,7 +13,7 @@ import nbclient
 import pytest
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
-NAMES = ["quickstart", "inside_the_method", "planning", "own_data", "thousand_maps"]
+NAMES = ["quickstart", "inside_the_method", "planning", "own_data", "poses", "thousand_maps"]
 
 
 def source(name):
@@ -82,6 +82,7 @@ def executed():
         ("own_data", 3, "median distance of held-out returns: ", 3),
         ("inside_the_method", 4, "both blended: ", 2),
         ("planning", 4, "later map: ", 25),
+        ("poses", 2, "error of the merged map: ", 5),
         ("thousand_maps", 2, "median error after 4 scans: ", 8),
     ],
 )

@@ -246,6 +246,29 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
     return matrix
 
 
+def check_covariance(name: str, covariance: np.ndarray) -> None:
+    """Checks that a matrix is the covariance of the error of a pose.
+
+    Args:
+        name: What messages call the argument.
+        covariance: (6, 6), m and rad.
+
+    Raises:
+        ValueError: The matrix is not finite, symmetric and positive definite.
+    """
+    exact = covariance.astype(np.float64)
+    expected = "expected a symmetric, positive definite matrix, m and rad"
+    if not np.isfinite(exact).all():
+        raise ValueError(f"{name} has values that are not finite, {expected}")
+    # In units of each component's own deviation: those of meters and radians differ.
+    size = np.sqrt(np.maximum(np.diag(exact), 1e-30))
+    scaled = exact / np.outer(size, size)
+    if not np.allclose(scaled, scaled.T, atol=1e-3):
+        raise ValueError(f"{name} is not symmetric, {expected}")
+    if np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] < 1e-5:
+        raise ValueError(f"{name} is not positive definite, {expected}")
+
+
 def is_traced(*values: Any) -> bool:
     """Returns whether some values, or members of their lists and tuples, are traced by JAX."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in _leaves(values))

@@ -33,6 +33,7 @@ from hiosdf_jax._src.numerics.intake import (
     as_floats,
     as_number,
     as_traced,
+    check_covariance,
     check_pose,
     cloud_and_returns,
     is_traced,
@@ -200,19 +201,5 @@ def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
         mean = check_pose(mean, "prior")
     if not is_traced(covariance):
         covariance = as_floats("prior covariance", covariance)
-        _check_covariance(covariance)
+        check_covariance("prior covariance", covariance)
     return jnp.asarray(mean, jnp.float32), jnp.asarray(covariance, jnp.float32)
-
-
-def _check_covariance(covariance: np.ndarray) -> None:
-    exact = covariance.astype(np.float64)
-    expected = "expected a symmetric, positive definite matrix, m and rad"
-    if not np.isfinite(exact).all():
-        raise ValueError(f"prior covariance has values that are not finite, {expected}")
-    # In units of each component's own deviation: those of meters and radians differ.
-    size = np.sqrt(np.maximum(np.diag(exact), 1e-30))
-    scaled = exact / np.outer(size, size)
-    if not np.allclose(scaled, scaled.T, atol=1e-3):
-        raise ValueError(f"prior covariance is not symmetric, {expected}")
-    if np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] < 1e-5:
-        raise ValueError(f"prior covariance is not positive definite, {expected}")
