@@ -208,6 +208,26 @@ def test_a_patch_that_no_ray_passes_goes_with_its_neighbors(monkeypatch, gone, l
     assert (state_of(after) == (0, -72)) == vanishes
 
 
+@pytest.mark.parametrize(
+    ("gone", "crossed", "vanishes"), [(4, 1, True), (3, 1, False), (4, 0, False)]
+)
+def test_a_patch_that_one_ray_crosses_goes_with_four_neighbors(
+    monkeypatch, gone, crossed, vanishes
+):
+    """A thin leg: one ray never crosses two quarters of its patch."""
+    monkeypatch.setitem(globals(), "SENSOR", np.array([-1.9, 0.55, 0.65]))
+    window = patch()
+    change = np.zeros(SHAPE, np.int8)
+    for step in [(1, 1, 1), (1, -1, 1), (1, 1, -1), (1, -1, -1)][:gone]:
+        change[tuple(np.add(CELL, step))] = -72
+    window = window._replace(change=jnp.asarray(change))
+    aside = square(0.12, 25)
+    aside = aside[np.abs(aside).max(axis=1) > 0.055]
+    ends = through(np.concatenate([aside, np.array([[0.02, 0.015]])[:crossed]]))
+    after, _ = scan(window, ends)
+    assert (state_of(after) == (0, -72)) == vanishes
+
+
 def test_vanished_places_are_forgotten_after_eight_scans_that_pass_them():
     window = patch()
     for _ in range(2):
