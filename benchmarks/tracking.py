@@ -109,26 +109,30 @@ def map_stream(frames, config, mode, seed=0):
         if not fused:
             refused.append(i)
     if mode == "jitter smoothed":
-        state, poses = map_again(frames, config, given, poses, refused)
+        state, poses, refused = map_again(frames, config, given, poses, refused)
     return state, poses, refused
 
 
 def map_again(frames, config, given, poses, refused):
-    """Maps frames at smoothed poses, and registers them in that map; returns map and poses."""
+    """Maps registered frames at smoothed poses, and registers all in that map.
+
+    Returns the map, the poses, and who was refused last.
+    """
     registered = ~np.isin(np.arange(len(frames)), refused)
-    for time_left in reversed(range(MAPPED_AGAIN)):
+    for rounds_left in reversed(range(MAPPED_AGAIN)):
         poses = hio.smooth_poses(poses, given, JITTER_COVARIANCE, registered)
         state = hio.init(config, jax.random.key(0))
-        for (cloud, _), pose in zip(frames, poses, strict=True):
-            state = hio.update(state, cloud, pose)
-        if time_left:
+        for (cloud, _), pose, is_registered in zip(frames, poses, registered, strict=True):
+            if is_registered:
+                state = hio.update(state, cloud, pose)
+        if rounds_left:
             found = [
                 hio.refine_pose(state, cloud, pose)
                 for (cloud, _), pose in zip(frames, poses, strict=True)
             ]
             poses = [np.asarray(each.pose) for each in found]
             registered = np.array([bool(each.converged) for each in found])
-    return state, list(poses)
+    return state, list(poses), np.flatnonzero(~registered).tolist()
 
 
 def describe(poses, frames):

@@ -11,7 +11,7 @@ from poses import random_pose
 from room import CONFIG
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.pipeline import prepare, warn_out_of_range, warn_outside
+from hiosdf_jax._src.mapping.pipeline import check_and_pad, warn_out_of_range, warn_outside
 from hiosdf_jax._src.numerics.intake import as_traced, check_pose, cloud_and_returns
 
 SEEDS = st.integers(0, 2**31)
@@ -148,7 +148,7 @@ def test_a_padded_cloud_is_what_update_maps(rows):
     cloud[0, 1] = np.nan if rows > 1 else 1.0
     padded = hio.pad_cloud(CONFIG, cloud, pose)
     assert padded.shape == (CONFIG.max_points, 3) and padded.dtype == np.float32
-    np.testing.assert_array_equal(padded, prepare(cloud, pose, CONFIG.max_points)[0])
+    np.testing.assert_array_equal(padded, check_and_pad(cloud, pose, CONFIG.max_points)[0])
     np.testing.assert_array_equal(padded, hio.pad_cloud(CONFIG, padded))  # no second draw
 
 

@@ -53,7 +53,7 @@ def take_apart(state: MapState, frame: Frame) -> dict[str, Part]:
     Returns:
         The stages by name, in order.
     """
-    cloud, pose = map(jnp.asarray, pipeline.prepare(*frame, state.config.max_points))
+    cloud, pose = map(jnp.asarray, pipeline.check_and_pad(*frame, state.config.max_points))
     step = jax.jit(begin)(state, cloud, jnp.all(jnp.isfinite(cloud), axis=-1), pose)
     parts = {}
     for stage in STAGES:

@@ -57,7 +57,7 @@ def whole_updates(setup: Setup, label: str, mapped: Mapped) -> Measured:
     """
     state = mapped.state
     cloud, pose = setup.frame(int(state.updates))
-    prepared = jax.device_put(pipeline.prepare(cloud, pose, state.config.max_points))
+    prepared = jax.device_put(pipeline.check_and_pad(cloud, pose, state.config.max_points))
     alone = time_ms(
         pipeline._update_jit,
         state,

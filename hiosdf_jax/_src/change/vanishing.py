@@ -46,7 +46,8 @@ _FORGOTTEN = -64
 # in a world that stands still: with 2 of 26 neighbors, 0.61 instead of 0.59 cm on a LiDAR stream.
 _LEAST_GONE_NEIGHBORS = 8
 
-# The same for one that a ray crosses: thin legs meet few rays. It cost no accuracy.
+# The same for one that a ray crosses, if all rays see past it: thin legs meet few rays. The errors
+# of house_depth, house_lidar and the demo stay as they are or fall by 1 %.
 _LEAST_GONE_IF_MET = 4
 _SPREADS = 3  # in one scan
 
@@ -159,7 +160,7 @@ def is_recent(change: jax.Array) -> jax.Array:
 def _look(
     config: Config, window: EvidenceWindow, rays: Rays, view: View, row: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Counts what a scan says against patches; finds those that a ray crosses, and all see past."""
+    """Returns doubt in patches, and masks of those that a ray crosses, and that all see past."""
     size, shape = config.voxel_size, window.hits.shape
     index = jnp.stack(jnp.unravel_index(row, shape), axis=-1)
     mean = take(window.mean.reshape(-1, 3), row)
@@ -211,7 +212,7 @@ def _look(
     quarters = jnp.zeros(row.shape, jnp.int32)
     for left in (False, True):
         for low in (False, True):
-            met = crosses & ((u < 0) == left) & ((v < 0) == low)
-            quarters += jnp.any(met, axis=-1)
+            here = crosses & ((u < 0) == left) & ((v < 0) == low)
+            quarters += jnp.any(here, axis=-1)
     several = (quarters == 2) & (jnp.sum(crosses, axis=-1) >= _SEVERAL_RAYS)
     return jnp.where(several, 2, jnp.maximum(quarters - 1, 0)), quarters > 0, past

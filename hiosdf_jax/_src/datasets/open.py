@@ -1,4 +1,8 @@
-"""Opens a recorded stream in any format, recognized by its file or folder."""
+"""Opens a recorded stream in any format, recognized by its file or folder.
+
+Each format is a function that returns a `Stream`, the protocol in `stream.py`. To add one, write
+the function in a module of its own and list it here.
+"""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def update(
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
         return run_update(state, *as_traced(cloud, pose), extras)
     config = state.config
-    cloud, pose = prepare(cloud, pose, config.max_points)
+    cloud, pose = check_and_pad(cloud, pose, config.max_points)
     limits = (config.min_range, config.max_range, config.min_in_range)
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
@@ -106,7 +106,7 @@ def run_update(
     cloud: jax.Array,
     pose: jax.Array,
     extras: Any,
-    raised: jax.Array | np.uint32 = _NO_FLAG,
+    flags_so_far: jax.Array | np.uint32 = _NO_FLAG,
     donate: bool = False,
 ) -> MapState:
     """Runs the compiled update, the same one for `update` and for tracking.
@@ -118,14 +118,14 @@ def run_update(
         cloud: (N, 3) float32. Outside jit checked, padded, and on the device.
         pose: (4, 4) float32, likewise.
         extras: `robot` and `noise`, checked.
-        raised: Flags of `Flag` that are raised before the checks, () uint32.
+        flags_so_far: Flags of `Flag` that are raised before the checks, () uint32.
         donate: As for `update`.
 
     Returns:
         The new map.
     """
     compiled = _update_donating if donate else _update_jit
-    return compiled(state, cloud, pose, *extras, raised)
+    return compiled(state, cloud, pose, *extras, flags_so_far)
 
 
 def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
@@ -158,7 +158,7 @@ def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
     return _pad_rows(*cloud_and_returns(cloud), config.max_points, pose)
 
 
-def prepare(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
+def check_and_pad(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.ndarray]:
     """Checks the values of a cloud and its pose, and brings the cloud to a fixed shape.
 
     Args:
@@ -316,12 +316,12 @@ def _update(
     pose: jax.Array,
     robot: tuple[jax.Array, jax.Array] | None,
     noise: jax.Array | None,
-    raised: jax.Array | np.uint32,
+    flags_so_far: jax.Array | np.uint32,
 ) -> MapState:
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    step = run_stages(begin(state, cloud, finite, pose, robot, noise, raised), CHECKS)
+    step = run_stages(begin(state, cloud, finite, pose, robot, noise, flags_so_far), CHECKS)
     return cond(
         is_accepted(step),
         lambda _, step: run_stages(step, FUSION).state,

@@ -100,10 +100,10 @@ def begin(
     pose: jax.Array,
     robot: tuple[jax.Array, jax.Array] | None = None,
     noise: jax.Array | None = None,
-    raised: jax.Array | np.uint32 | int = 0,
+    flags_so_far: jax.Array | np.uint32 | int = 0,
 ) -> Step:
-    """Starts an update: draws its keys, stores the next one in the map, adds to flags raised."""
-    flags = raised | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD)
+    """Starts an update: draws its keys, stores the next one in the map, adds to its flags."""
+    flags = flags_so_far | jnp.where(jnp.any(finite), 0, Flag.EMPTY_CLOUD)
     flags |= jnp.where(is_rigid(pose), 0, Flag.BAD_POSE)
     flags |= jnp.where(extras_are_valid(robot, noise), 0, Flag.BAD_ARGUMENT)
     key, grid_key, cloud_key, order_key, bound_key = jax.random.split(state.key, 5)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
-from hiosdf_jax._src.mapping.pipeline import prepare, run_update
+from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
@@ -88,14 +88,14 @@ def track(
         cloud, pose = as_traced(cloud, predicted_pose)
         fused_cloud, start = cloud, pose
     else:
-        padded, pose = prepare(cloud, predicted_pose, state.config.max_points)
+        padded, pose = check_and_pad(cloud, predicted_pose, state.config.max_points)
         fused_cloud, start = jax.device_put((padded, pose))
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
-    found, raised = _register_jit(state.updates, start, found, own, reach)
+    found, flags_so_far = _register_jit(state.updates, start, found, own, reach)
     extras, donate = (None, checked_noise), donate and not traced
-    return run_update(state, fused_cloud, found.pose, extras, raised, donate), found
+    return run_update(state, fused_cloud, found.pose, extras, flags_so_far, donate), found
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:

@@ -6,28 +6,50 @@ from typing import Any
 
 import numpy as np
 
-from hiosdf_jax._src.numerics.intake import as_real, check_covariance, check_pose
+from hiosdf_jax._src.numerics.intake import (
+    as_number,
+    as_real,
+    check_covariance,
+    check_pose,
+    is_traced,
+)
+
+# A given pose counts at least as if its standard deviation were this, m and rad: with less, the
+# normal equations are singular to rounding.
+_MOST_DEVIATION = 1000.0
 
 
 def smooth_poses(
-    poses: Any, given_poses: Any, covariance: Any, registered: Any | None = None
+    poses: Any,
+    given_poses: Any,
+    covariance: Any,
+    registered: Any | None = None,
+    motion_deviation: tuple[float, float] = (0.002, 0.0005),
 ) -> np.ndarray:
     """Corrects the drift of registered poses by given ones, which are noisy but do not drift.
 
-    A robot that is localized by GPS, by beacons or in a floor plan has such poses. `track` removes
-    their noise, but its own errors add up. Map the stream again at the poses that this returns.
+    `track` trades the noise of given poses for drift. This finds the trajectory that keeps the
+    registered motion from frame to frame and stays near the given poses. Map the stream again at
+    the poses that it returns.
 
-    It minimizes the sum of squares of two kinds of errors, robustly (pseudo-Huber): of each pose
-    against the given one, and of the motion between neighboring frames against that of the
-    registered poses. Runs on the host, not inside `jit`.
+    With r_i the error of a pose against the given one, and m_i the error of its motion from the
+    pose before against the registered motion, both in standard deviations, it minimizes the sum of
+    12 (sqrt(1 + |e|^2 / 6) - 1) over all e of r_i and m_i: pseudo-Huber, so that single wild poses
+    bend nothing. All errors are assumed to be independent of each other. Runs on the host, not
+    inside `jit`.
 
     Args:
         poses: (N, 4, 4) T_world_sensor, registered, in the order of the stream.
         given_poses: (N, 4, 4) T_world_sensor, of the same frames.
         covariance: (6, 6) of the error of each given pose, as in `Registration`: m along the axes
-            of the world frame, and rad about the sensor. Or (N, 6, 6), one for each pose.
-        registered: (N,) bool, whether each frame was registered; by default all were. The pose of
-            one that was not is a guess, and the motion to and from it counts for nothing.
+            of the world frame, and rad about the sensor. Or (N, 6, 6), one for each pose. Give an
+            unknown rotation a standard deviation of 10 rad.
+        registered: (N,) bool, whether each frame was registered; by default all were. The motion
+            to and from one that was not does not count. It takes its given pose, even if that is
+            wild: do not fuse such frames.
+        motion_deviation: Standard deviations of the registered motion between two frames, along
+            each axis, m and rad. The default is measured on a depth camera whose frames are up to
+            1 m apart.
 
     Returns:
         (N, 4, 4) float32 T_world_sensor.
@@ -38,22 +60,29 @@ def smooth_poses(
 
     Example:
         >>> covariance = np.diag([0.01**2] * 3 + [0.01**2] * 3)  # m, rad
-        >>> poses = hio.smooth_poses(tracked, given, covariance)
-        >>> for cloud, pose in zip(clouds, poses):
+        >>> poses = hio.smooth_poses(tracked, given, covariance, registered)
+        >>> for cloud, pose in zip(clouds[registered], poses[registered]):
         ...     state = hio.update(state, cloud, pose)
     """
     # Imported here, so that the core needs no scipy.
     from hiosdf_jax._src.mapping.registration.pose_chains import fit_chain
 
-    registered_poses = _check_poses("poses", poses)
-    given = _check_poses("given_poses", given_poses, len(registered_poses))
+    start = _check_poses("poses", poses)
+    given = _check_poses("given_poses", given_poses, len(start))
     weights = _weights_of(covariance, len(given))
     known = _check_registered(registered, len(given))
-    return fit_chain(registered_poses, known, given, weights).astype(np.float32)
+    deviation = [as_number("motion_deviation", each, 0, above=True) for each in motion_deviation]
+    if len(deviation) != 2:
+        raise ValueError(f"motion_deviation is {motion_deviation}, expected (m, rad)")
+    if len(given) == 0:
+        return np.zeros((0, 4, 4), np.float32)
+    return fit_chain(start, known, given, weights, np.repeat(deviation, 3)).astype(np.float32)
 
 
 def _check_poses(name: str, poses: Any, count: int | None = None) -> np.ndarray:
     array = as_real(name, poses).astype(np.float64)
+    if array.size == 0 and count in (None, 0):
+        return np.zeros((0, 4, 4))
     expected = "(N, 4, 4)" if count is None else f"({count}, 4, 4)"
     if array.ndim != 3 or array.shape[1:] != (4, 4) or count not in (None, len(array)):
         raise ValueError(f"{name} has shape {array.shape}, expected {expected}")
@@ -63,7 +92,14 @@ def _check_poses(name: str, poses: Any, count: int | None = None) -> np.ndarray:
 
 
 def _check_registered(registered: Any | None, count: int) -> np.ndarray:
-    mask = np.ones(count, bool) if registered is None else np.asarray(registered)
+    if registered is None or count == 0:
+        return np.ones(count, bool)
+    if is_traced(registered):
+        raise ValueError("registered is traced, expected concrete values, as outside jit")
+    try:
+        mask = np.asarray(registered)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"registered is no array: {error}") from error
     if mask.shape != (count,) or mask.dtype != bool:
         raise ValueError(f"registered is {mask.dtype} {mask.shape}, expected bool ({count},)")
     return mask
@@ -72,8 +108,13 @@ def _check_registered(registered: Any | None, count: int) -> np.ndarray:
 def _weights_of(covariance: Any, count: int) -> np.ndarray:
     """Returns matrices (N, 6, 6) that turn an error into independent ones of variance 1."""
     array = as_real("covariance", covariance).astype(np.float64)
-    if array.shape not in ((6, 6), (count, 6, 6)):
+    if array.shape == (6, 6):
+        check_covariance("covariance", array)
+    elif array.shape == (count, 6, 6):
+        for i, each in enumerate(array):
+            check_covariance(f"covariance[{i}]", each)
+    else:
         raise ValueError(f"covariance has shape {array.shape}, expected (6, 6) or ({count}, 6, 6)")
-    for each in array.reshape(-1, 6, 6):
-        check_covariance("covariance", each)
-    return np.linalg.inv(np.linalg.cholesky(np.broadcast_to(array, (count, 6, 6))))
+    information = np.linalg.inv(array) + np.eye(6) / _MOST_DEVIATION**2
+    root = np.linalg.cholesky((information + np.swapaxes(information, -1, -2)) / 2)
+    return np.broadcast_to(np.swapaxes(root, -1, -2), (count, 6, 6))
