@@ -70,9 +70,9 @@ def test_update_is_the_stages_one_by_one(program, empty_map, frame):
             step = stage(step)
         return step.state
 
-    def by_hand(state, cloud, pose, noise, raised):
+    def by_hand(state, cloud, pose, noise, flags_so_far):
         finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-        step = begin(state, cloud, finite, pose, noise=noise, raised=raised)
+        step = begin(state, cloud, finite, pose, noise=noise, flags_so_far=flags_so_far)
         for stage in CHECKS:
             step = stage(step)
         return jax.lax.cond(is_accepted(step), fused, refuse, state, step)
