@@ -1,5 +1,7 @@
 """Where a cloud is in a map, without a guess: found, and ambiguous where the world is."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,13 @@ from room import HALF, room_cloud
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.registration.relocalizing import _turn_onto
+from hiosdf_jax._src.mapping.registration.relocalizing import (
+    _ROUNDS,
+    _copy,
+    _hypotheses_for,
+    _turn_onto,
+    _Upright,
+)
 
 RESOLUTION = 0.05
 COUNT = 700
@@ -116,6 +124,24 @@ def test_a_direction_is_turned_onto_another(end):
     np.testing.assert_allclose(turn @ [0, 0, 1], end, atol=1e-5)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-5)
     assert np.linalg.det(turn) > 0
+
+
+def test_one_copy_of_each_hypothesis_stays():
+    """So a round never makes a hypothesis worse."""
+    tried = _Upright(jnp.arange(12.0).reshape(4, 3), jnp.arange(4.0))
+    copies = _copy(tried, _ROUNDS[0], jax.random.key(0))
+    for part, moved in zip(tried, copies, strict=True):
+        np.testing.assert_array_equal(moved[:, 0], part)
+        assert len(np.unique(moved[0].reshape(-1, *np.shape(part[0])), axis=0)) == moved.shape[1]
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [((20, 20, 20), 65_536), ((100, 100, 100), 250_000), ((400, 400, 100), 2_097_152)],
+)
+def test_large_maps_get_more_hypotheses(shape, expected):
+    config = SimpleNamespace(grid_shape=shape)
+    assert _hypotheses_for(SimpleNamespace(config=config)) == expected
 
 
 def test_an_empty_map_knows_no_place(empty_map):

@@ -1,12 +1,15 @@
 """Finds the pose of a cloud in a map without any guess: from many hypotheses to a few, to the best.
 
 Hypotheses lie in free space, upright, and turned by any angle about the vertical. All are scored
-with few returns, the best of them are brought near a solution by coarse steps, and the best two
-places are refined.
+with few returns. Two rounds move the better ones a little at random and score them with more
+returns. The best of them are brought near a solution by coarse steps, and the best four places are
+refined.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -41,10 +44,28 @@ from hiosdf_jax._src.state import Baked, Field
 # A sensor is at least this far from surfaces, m.
 _CLEARANCE_M = 0.15
 
+# By default there is one hypothesis per this many voxels, within these limits. In a furnished hall
+# with 7,000 m3 of free space 0.5 million find 87 of 89 places, 4 million all, in twice the time.
+_VOXELS_EACH = 4
+_LEAST_HYPOTHESES, _MOST_HYPOTHESES = 2**16, 2**21
+
 # Hypotheses are scored with this many returns. One that lies this far from a surface counts half.
-_FEW_ROWS = 64
+_FIRST_ROWS = 64
 _LOOSE_M = 0.3
 _AT_ONCE = 4096
+
+
+class _Round(NamedTuple):
+    """Replaces the best hypotheses, one in `one_in` of all, by the best of their moved copies."""
+
+    one_in: int
+    rows: int  # returns that score the copies
+    way_m: float  # standard deviations of what they are moved by
+    turn_rad: float
+
+
+_ROUNDS = _Round(64, 128, 0.4, 0.1), _Round(512, 256, 0.2, 0.05)
+_COPIES = 16
 
 # The best hypotheses, and the returns by which they are brought near a solution.
 _KEPT = 256
@@ -81,7 +102,7 @@ def relocalize(
     field: AnyField,
     cloud: Any,
     key: jax.Array,
-    hypotheses: int = 65_536,
+    hypotheses: int | None = None,
     *,
     up_sensor: Any = (0.0, 0.0, 1.0),
     up_world: Any = (0.0, 0.0, 1.0),
@@ -96,7 +117,8 @@ def relocalize(
         field: A map, a snapshot of one, or a baked field.
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
         key: Source of the hypotheses, from `jax.random.key`.
-        hypotheses: How many are tried, at least 256. A house of 19 x 11 m needs the default.
+        hypotheses: How many random poses are tried, at least 256. The default is one per 4 voxels
+            of the map, from 65,536 to 2,097,152.
         up_sensor: The direction against gravity in the sensor's frame, (3,). A level camera whose y
             points down has (0, -1, 0).
         up_world: The direction against gravity in the map's frame, (3,).
@@ -114,6 +136,8 @@ def relocalize(
         >>> sure = place.best.converged & (place.score > place.other_score + 0.2)
     """
     field = as_field(field)
+    if hypotheses is None:
+        hypotheses = _hypotheses_for(field)
     check_whole("hypotheses", hypotheses, _KEPT)
     key = as_key("key", key)
     ups = [_direction("up_sensor", up_sensor), _direction("up_world", up_world)]
@@ -164,28 +188,14 @@ def _find_places(
     hypotheses: int,
 ) -> jax.Array:
     """Finds poses at different places, the best first, (PLACES, 4, 4)."""
-    cells = _cells_of(field)
-    place_key, turn_key = jax.random.split(key)
-    positions = _draw_free(cells, place_key, hypotheses)
-    angles = jax.random.uniform(turn_key, (hypotheses,), jnp.float32, maxval=2 * jnp.pi)
     up = up_world / jnp.linalg.norm(up_world)
     level = _turn_onto(up_sensor / jnp.linalg.norm(up_sensor), up)
 
-    def pose_of(position: jax.Array, angle: jax.Array) -> jax.Array:
-        turn = jnp.matmul(rotation_of(angle * up), level, precision="highest")
-        return jnp.eye(4, dtype=jnp.float32).at[:3, :3].set(turn).at[:3, 3].set(position)
+    def pose_of(at: _Upright) -> jax.Array:
+        turn = jnp.matmul(rotation_of(at.angle_rad * up), level, precision="highest")
+        return jnp.eye(4, dtype=jnp.float32).at[:3, :3].set(turn).at[:3, 3].set(at.position_world)
 
-    few, few_some = draw_evenly(jnp.where(some[:, None], points, jnp.nan), _FEW_ROWS)
-    costs = _costs(cells)
-
-    def cost(hypothesis: tuple[jax.Array, jax.Array]) -> jax.Array:
-        found = _look_up(cells, costs, 1.0, _place(pose_of(*hypothesis), few))
-        return jnp.sum(jnp.where(few_some, found, 0))
-
-    total = jax.lax.map(cost, (positions, angles), batch_size=_AT_ONCE)
-    _, kept = jax.lax.top_k(-total, _KEPT)
-    starts = jax.vmap(pose_of)(positions[kept], angles[kept])
-
+    starts = _search(field, jnp.where(some[:, None], points, jnp.nan), key, pose_of, hypotheses)
     rows = _rows(field, points, some)
     fewer = take_evenly(rows, _KEPT_ROWS)
 
@@ -201,6 +211,58 @@ def _find_places(
         chosen.append(poses[best])
         scores = jnp.where(_same_place(poses[best], poses), -1, scores)
     return jnp.stack(chosen)
+
+
+def _search(
+    field: Field | Baked,
+    points: jax.Array,
+    key: jax.Array,
+    pose_of: Callable[[_Upright], jax.Array],
+    hypotheses: int,
+) -> jax.Array:
+    """Finds the poses where returns lie near surfaces, the best first, (KEPT, 4, 4)."""
+    cells = _cells_of(field)
+    costs = _costs(cells)
+    place_key, turn_key, *round_keys = jax.random.split(key, 2 + len(_ROUNDS))
+
+    def score(tried: _Upright, rows: int) -> jax.Array:
+        few, some = draw_evenly(points, rows)
+
+        def cost(at: _Upright) -> jax.Array:
+            found = _look_up(cells, costs, 1.0, _place(pose_of(at), few))
+            return jnp.sum(jnp.where(some, found, 0))
+
+        return jax.lax.map(cost, tried, batch_size=_AT_ONCE)
+
+    angles = jax.random.uniform(turn_key, (hypotheses,), jnp.float32, maxval=2 * jnp.pi)
+    tried = _Upright(_draw_free(cells, place_key, hypotheses), angles)
+    costs_of_tried = score(tried, _FIRST_ROWS)
+    for each, round_key in zip(_ROUNDS, round_keys, strict=True):
+        count = max(_KEPT, hypotheses // each.one_in)
+        copies = _copy(_best(tried, costs_of_tried, count), each, round_key)
+        costs_of_copies = score(jax.tree.map(jnp.concatenate, copies), each.rows)
+        costs_of_copies = costs_of_copies.reshape(count, _COPIES)
+        best = jnp.argmin(costs_of_copies, axis=1)
+        tried = jax.tree.map(lambda part, best=best: part[jnp.arange(len(best)), best], copies)
+        costs_of_tried = jnp.min(costs_of_copies, axis=1)
+    return jax.vmap(pose_of)(_best(tried, costs_of_tried, _KEPT))
+
+
+def _best(tried: _Upright, costs: jax.Array, count: int) -> _Upright:
+    _, kept = jax.lax.top_k(-costs, count)
+    return jax.tree.map(lambda part: part[kept], tried)
+
+
+def _copy(tried: _Upright, each: _Round, key: jax.Array) -> _Upright:
+    """Moves copies of hypotheses at random; the first copy stays, (N, COPIES, ...)."""
+    count = len(tried.angle_rad)
+    way_key, turn_key = jax.random.split(key)
+    way = each.way_m * jax.random.normal(way_key, (count, _COPIES, 3), jnp.float32)
+    turn = each.turn_rad * jax.random.normal(turn_key, (count, _COPIES), jnp.float32)
+    return _Upright(
+        tried.position_world[:, None] + way.at[:, 0].set(0),
+        tried.angle_rad[:, None] + turn.at[:, 0].set(0),
+    )
 
 
 @jax.jit
@@ -221,6 +283,13 @@ def _choose(
     return Relocalization(take(best), scores[best], take(other), elsewhere[other])
 
 
+class _Upright(NamedTuple):
+    """Where an upright sensor is, and by how much it is turned about the vertical."""
+
+    position_world: jax.Array  # (..., 3) m
+    angle_rad: jax.Array  # (...)
+
+
 class _Cells(NamedTuple):
     """The map in cells: voxels, or the surroundings of samples."""
 
@@ -238,6 +307,11 @@ def _cells_of(field: Field | Baked) -> _Cells:
     corner_world = jnp.asarray(config.corner_index, jnp.float32) * config.voxel_size
     distance = derived.sdf.astype(jnp.float32)
     return _Cells(corner_world, config.voxel_size, distance, derived.frontier_steps > 0)
+
+
+def _hypotheses_for(field: Field | Baked) -> int:
+    voxels = field.sdf.size if isinstance(field, Baked) else math.prod(field.config.grid_shape)
+    return min(max(voxels // _VOXELS_EACH, _LEAST_HYPOTHESES), _MOST_HYPOTHESES)
 
 
 def _costs(cells: _Cells) -> jax.Array:
