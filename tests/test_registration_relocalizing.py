@@ -137,7 +137,7 @@ def test_one_copy_of_each_hypothesis_stays():
 
 @pytest.mark.parametrize(
     ("shape", "expected"),
-    [((20, 20, 20), 65_536), ((100, 100, 100), 250_000), ((400, 400, 100), 2_097_152)],
+    [((20, 20, 20), 65_536), ((100, 100, 100), 250_000), ((400, 500, 100), 4_194_304)],
 )
 def test_large_maps_get_more_hypotheses(shape, expected):
     config = SimpleNamespace(grid_shape=shape)

@@ -26,7 +26,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.matching import noise_of
-from hiosdf_jax._src.mapping.registration.motion import offsets_from, rotation_of, way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import solve_coarse
@@ -45,9 +45,9 @@ from hiosdf_jax._src.state import Baked, Field
 _CLEARANCE_M = 0.15
 
 # By default there is one hypothesis per this many voxels, within these limits. In a furnished hall
-# with 7,000 m3 of free space 0.5 million find 87 of 89 places, 4 million all, in twice the time.
+# with 7,000 m3 of free space 0.5 million find 87 of 89 places, 2 million 85 to 88, 4 million all.
 _VOXELS_EACH = 4
-_LEAST_HYPOTHESES, _MOST_HYPOTHESES = 2**16, 2**21
+_LEAST_HYPOTHESES, _MOST_HYPOTHESES = 2**16, 2**22
 
 # Hypotheses are scored with this many returns. One that lies this far from a surface counts half.
 _FIRST_ROWS = 64
@@ -118,7 +118,7 @@ def relocalize(
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
         key: Source of the hypotheses, from `jax.random.key`.
         hypotheses: How many random poses are tried, at least 256. The default is one per 4 voxels
-            of the map, from 65,536 to 2,097,152.
+            of the map, from 65,536 to 4,194,304.
         up_sensor: The direction against gravity in the sensor's frame, (3,). A level camera whose y
             points down has (0, -1, 0).
         up_world: The direction against gravity in the map's frame, (3,).
@@ -229,8 +229,7 @@ def _search(
         few, some = draw_evenly(points, rows)
 
         def cost(at: _Upright) -> jax.Array:
-            found = _look_up(cells, costs, 1.0, _place(pose_of(at), few))
-            return jnp.sum(jnp.where(some, found, 0))
+            return jnp.sum(jnp.where(some, _look_up(cells, costs, pose_of(at), few), 0))
 
         return jax.lax.map(cost, tried, batch_size=_AT_ONCE)
 
@@ -320,15 +319,21 @@ def _costs(cells: _Cells) -> jax.Array:
     return jnp.where(cells.seen, square / (square + _LOOSE_M**2), 1)
 
 
-def _look_up(
-    cells: _Cells, values: jax.Array, outside: float, points_world: jax.Array
-) -> jax.Array:
-    """Reads the values (X, Y, Z) of the cells in which points (N, 3) lie."""
-    shape = jnp.asarray(values.shape, jnp.float32)
-    cell = jnp.floor((points_world - cells.corner_world) / cells.size)
-    inside = jnp.all((cell >= 0) & (cell < shape), axis=-1)
-    x, y, z = jnp.where(inside[:, None], cell, 0).astype(jnp.int32).T
-    return jnp.where(inside, values.ravel()[geometry.flat_index(values.shape, (x, y, z))], outside)
+def _look_up(cells: _Cells, costs: jax.Array, pose: jax.Array, points: jax.Array) -> jax.Array:
+    """Reads the costs of returns (N, 3) of a sensor at a pose, (N,); outside the map 1.
+
+    Axis by axis: on a CPU six times as fast as with points in rows.
+    """
+    x, y, z = points.T
+    inside, index = True, 0
+    for axis, size in enumerate(costs.shape):
+        turn_x, turn_y, turn_z, position = pose[axis]
+        world = turn_x * x + turn_y * y + turn_z * z + position
+        cell = jnp.floor((world - cells.corner_world[axis]) / cells.size)
+        known = (cell >= 0) & (cell < size)
+        index = index * size + jnp.where(known, cell, 0).astype(jnp.int32)
+        inside &= known
+    return jnp.where(inside, costs.ravel().at[index].get(mode="promise_in_bounds"), 1)
 
 
 def _draw_free(cells: _Cells, key: jax.Array, count: int) -> jax.Array:
@@ -354,10 +359,6 @@ def _turn_onto(start: jax.Array, end: jax.Array) -> jax.Array:
     sine = jnp.linalg.norm(axis)
     angle = jnp.where(opposite, jnp.pi, jnp.arctan2(sine, cosine))
     return rotation_of(angle * axis / jnp.maximum(sine, 1e-9))
-
-
-def _place(pose: jax.Array, points: jax.Array) -> jax.Array:
-    return offsets_from(pose, points) + pose[:3, 3]
 
 
 def _rows(field: Field | Baked, points: jax.Array, some: jax.Array) -> Rows:
