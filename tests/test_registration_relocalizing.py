@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.registration.relocalizing import (
     _ROUNDS,
+    _Cells,
     _copy,
     _hypotheses_for,
+    _look_up,
     _turn_onto,
     _Upright,
 )
@@ -124,6 +126,31 @@ def test_a_direction_is_turned_onto_another(end):
     np.testing.assert_allclose(turn @ [0, 0, 1], end, atol=1e-5)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-5)
     assert np.linalg.det(turn) > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_costs_of_returns_are_those_of_their_cells(seed):
+    """Against numpy in float64; returns on the border between cells may be on either side."""
+    rng = np.random.default_rng(seed)
+    shape, corner, size = (5, 7, 4), np.array([-1.0, 0.5, -2.0]), 0.4
+    costs = rng.uniform(size=shape).astype(np.float32)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(rng=seed).as_matrix()
+    pose[:3, 3] = corner + 0.5 * size * np.array(shape)
+    points = rng.uniform(-1.5, 1.5, (500, 3))
+    points[0] = 1e9  # no int32 holds its cell
+    cell = (points @ pose[:3, :3].T + pose[:3, 3] - corner) / size
+    index = np.floor(cell).astype(int)
+    inside = ((index >= 0) & (index < shape)).all(axis=1)
+    expected = np.where(inside, costs[tuple(np.where(inside[:, None], index, 0).T)], 1)
+    clear = (np.abs(cell - np.round(cell)) > 1e-4).all(axis=1)
+    cells = _Cells(
+        jnp.asarray(corner, jnp.float32), size, jnp.asarray(costs), jnp.ones(shape, bool)
+    )
+    arguments = (jnp.asarray(each, jnp.float32) for each in (pose, points))
+    found = np.asarray(_look_up(cells, jnp.asarray(costs), *arguments))
+    assert 50 < inside.sum() < 450
+    np.testing.assert_array_equal(found[clear], expected[clear])
 
 
 def test_one_copy_of_each_hypothesis_stays():

@@ -39,6 +39,7 @@ from hiosdf_jax._src.numerics.intake import (
     is_traced,
 )
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.vectors import dot, each, split
 from hiosdf_jax._src.state import Baked, Field
 
 # A sensor is at least this far from surfaces, m.
@@ -236,13 +237,13 @@ def _search(
     angles = jax.random.uniform(turn_key, (hypotheses,), jnp.float32, maxval=2 * jnp.pi)
     tried = _Upright(_draw_free(cells, place_key, hypotheses), angles)
     costs_of_tried = score(tried, _FIRST_ROWS)
-    for each, round_key in zip(_ROUNDS, round_keys, strict=True):
-        count = max(_KEPT, hypotheses // each.one_in)
-        copies = _copy(_best(tried, costs_of_tried, count), each, round_key)
-        costs_of_copies = score(jax.tree.map(jnp.concatenate, copies), each.rows)
-        costs_of_copies = costs_of_copies.reshape(count, _COPIES)
-        best = jnp.argmin(costs_of_copies, axis=1)
-        tried = jax.tree.map(lambda part, best=best: part[jnp.arange(len(best)), best], copies)
+    for a_round, round_key in zip(_ROUNDS, round_keys, strict=True):
+        count = max(_KEPT, hypotheses // a_round.one_in)
+        copies = _copy(_best(tried, costs_of_tried, count), a_round, round_key)
+        flat = _Upright(copies.position_world.reshape(-1, 3), copies.angle_rad.ravel())
+        costs_of_copies = score(flat, a_round.rows).reshape(count, _COPIES)
+        best = jnp.arange(count), jnp.argmin(costs_of_copies, axis=1)
+        tried = _Upright(copies.position_world[best], copies.angle_rad[best])
         costs_of_tried = jnp.min(costs_of_copies, axis=1)
     return jax.vmap(pose_of)(_best(tried, costs_of_tried, _KEPT))
 
@@ -252,12 +253,12 @@ def _best(tried: _Upright, costs: jax.Array, count: int) -> _Upright:
     return jax.tree.map(lambda part: part[kept], tried)
 
 
-def _copy(tried: _Upright, each: _Round, key: jax.Array) -> _Upright:
+def _copy(tried: _Upright, a_round: _Round, key: jax.Array) -> _Upright:
     """Moves copies of hypotheses at random; the first copy stays, (N, COPIES, ...)."""
     count = len(tried.angle_rad)
     way_key, turn_key = jax.random.split(key)
-    way = each.way_m * jax.random.normal(way_key, (count, _COPIES, 3), jnp.float32)
-    turn = each.turn_rad * jax.random.normal(turn_key, (count, _COPIES), jnp.float32)
+    way = a_round.way_m * jax.random.normal(way_key, (count, _COPIES, 3), jnp.float32)
+    turn = a_round.turn_rad * jax.random.normal(turn_key, (count, _COPIES), jnp.float32)
     return _Upright(
         tried.position_world[:, None] + way.at[:, 0].set(0),
         tried.angle_rad[:, None] + turn.at[:, 0].set(0),
@@ -324,16 +325,15 @@ def _look_up(cells: _Cells, costs: jax.Array, pose: jax.Array, points: jax.Array
 
     Axis by axis: on a CPU six times as fast as with points in rows.
     """
-    x, y, z = points.T
-    inside, index = True, 0
-    for axis, size in enumerate(costs.shape):
-        turn_x, turn_y, turn_z, position = pose[axis]
-        world = turn_x * x + turn_y * y + turn_z * z + position
-        cell = jnp.floor((world - cells.corner_world[axis]) / cells.size)
-        known = (cell >= 0) & (cell < size)
-        index = index * size + jnp.where(known, cell, 0).astype(jnp.int32)
-        inside &= known
-    return jnp.where(inside, costs.ravel().at[index].get(mode="promise_in_bounds"), 1)
+    point = split(points)
+    offset = each(lambda axis: dot(point, split(axis)), pose[:3, :3])
+    world = each(jnp.add, offset, pose[:3, 3])
+    cell = each(lambda w, corner: jnp.floor((w - corner) / cells.size), world, cells.corner_world)
+    x, y, z = each(lambda c, n: (c >= 0) & (c < n), cell, costs.shape)
+    inside = x & y & z
+    index = each(lambda c: jnp.where(inside, c, 0).astype(jnp.int32), cell)
+    flat = geometry.flat_index(costs.shape, index)
+    return jnp.where(inside, costs.ravel().at[flat].get(mode="promise_in_bounds"), 1)
 
 
 def _draw_free(cells: _Cells, key: jax.Array, count: int) -> jax.Array:
