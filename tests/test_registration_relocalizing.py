@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from poses import random_pose
 from room import HALF, room_cloud
 from scipy.spatial.transform import Rotation
 
@@ -134,8 +135,7 @@ def test_the_costs_of_returns_are_those_of_their_cells(seed):
     rng = np.random.default_rng(seed)
     shape, corner, size = (5, 7, 4), np.array([-1.0, 0.5, -2.0]), 0.4
     costs = rng.uniform(size=shape).astype(np.float32)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.random(rng=seed).as_matrix()
+    pose = random_pose(rng)
     pose[:3, 3] = corner + 0.5 * size * np.array(shape)
     points = rng.uniform(-1.5, 1.5, (500, 3))
     points[0] = 1e9  # no int32 holds its cell
