@@ -11,14 +11,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.mapping.registration.matching import match_points
+from hiosdf_jax._src.mapping.registration.matching import between, match_points
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move, offsets_from
 from hiosdf_jax._src.mapping.registration.selection import even_steps
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 from hiosdf_jax._src.state import Baked, Field
 
 INLIER_DEVIATIONS = 3.0
-"""The weight of a return falls to a quarter at this many standard deviations."""
+"""Returns within this many standard deviations of a surface lie on it."""
+
+# The weight of a return falls to a quarter at this many standard deviations: in a complete map, and
+# in one that grows. There, patches that were hit a few times are off by more than their spread.
+_OUTLIER_DEVIATIONS = INLIER_DEVIATIONS, 1.5
 
 # No patch is known better than this, m, and no return across its ray better than this, rad: pixels
 # and beams are that wide. Without it distant surfaces at grazing angles count too much.
@@ -65,12 +69,14 @@ class Rows(NamedTuple):
         sigma: Standard deviation of the range, (N,) m.
         some: The row is a return, (N,) bool.
         length: Typical range, () m: a rotation by 1 rad counts as this many meters.
+        growing: How incomplete the map is, () from 0 to 1: a return may be of a new surface.
     """
 
     points: jax.Array
     sigma: jax.Array
     some: jax.Array
     length: jax.Array
+    growing: jax.Array
 
 
 class Residuals(NamedTuple):
@@ -119,13 +125,19 @@ class Directions(NamedTuple):
     free: jax.Array
 
 
-def make_rows(points: jax.Array, some: jax.Array, noise: tuple[jax.Array, jax.Array]) -> Rows:
+def make_rows(
+    points: jax.Array,
+    some: jax.Array,
+    noise: tuple[jax.Array, jax.Array],
+    growing: jax.Array | float = 0.0,
+) -> Rows:
     """Prepares returns.
 
     Args:
         points: (N, 3) m, sensor frame, finite.
         some: The row is a return, (N,) bool.
         noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m.
+        growing: See `Rows`.
 
     Returns:
         The rows.
@@ -133,12 +145,13 @@ def make_rows(points: jax.Array, some: jax.Array, noise: tuple[jax.Array, jax.Ar
     square = jnp.sum(points**2, axis=-1)
     mean = jnp.sum(jnp.where(some, square, 0)) / jnp.maximum(jnp.sum(some), 1)
     length = jnp.clip(jnp.sqrt(jnp.maximum(jax.lax.stop_gradient(mean), 1e-6)), *_RANGES_M)
-    return Rows(points, noise[0] + noise[1] * square, some, length)
+    sigma = noise[0] + noise[1] * square
+    return Rows(points, sigma, some, length, jnp.asarray(growing, jnp.float32))
 
 
 def take_rows(rows: Rows, index: jax.Array | slice) -> Rows:
     """Selects some of the rows; their typical range stays."""
-    return Rows(rows.points[index], rows.sigma[index], rows.some[index], rows.length)
+    return rows._replace(points=rows.points[index], sigma=rows.sigma[index], some=rows.some[index])
 
 
 def take_evenly(rows: Rows, count: int = _EVEN_ROWS) -> Rows:
@@ -168,7 +181,7 @@ def compare(
     """
     offset = offsets_from(pose, rows.points)
     points_world = offset + pose[:3, 3]
-    match = match_points(field, points_world, rows.some)
+    match = match_points(field, points_world, rows.some, rows.growing)
     # Only the part of the error along the normal counts.
     square = jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-6)
     along = jnp.minimum(jnp.sum(match.normal * offset, axis=-1) ** 2 / square, 1)
@@ -176,9 +189,10 @@ def compare(
     variance += match.spread**2 + _LEAST_SIGMA_M**2
     comparable = rows.some & match.usable
     comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - _TRACKING_M))
-    sigma = jnp.sqrt(variance + (scale_m / INLIER_DEVIATIONS) ** 2)
+    deviations = between(_OUTLIER_DEVIATIONS, rows.growing)
+    sigma = jnp.sqrt(variance + (scale_m / deviations) ** 2)
     # The function of Geman and McClure.
-    ratio = match.distance / (INLIER_DEVIATIONS * sigma)
+    ratio = match.distance / (deviations * sigma)
     weight = jnp.where(comparable, 1 / (sigma * (1 + ratio**2)) ** 2, 0)
     turn = jnp.cross(offset, match.normal) / rows.length
     jacobian = jnp.concatenate([match.normal, turn], axis=-1)

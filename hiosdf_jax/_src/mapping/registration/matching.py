@@ -18,9 +18,10 @@ from hiosdf_jax._src.state import Baked, Field
 _LEAST_SLOPE = 0.5
 
 # Points farther from a patch along its plane are beside the surface that is known so far. They
-# would pull a cloud back to where the map ends. Narrower patches show no normal.
-_MOST_BESIDE_VOXELS = 0.8
-_LEAST_WIDTH_VOXELS = 0.1
+# would pull a cloud back to where the map ends. Narrower patches show no normal. The second values
+# are for a map that grows: patches at its border are the least exact ones.
+_MOST_BESIDE_VOXELS = 0.8, 0.4
+_LEAST_WIDTH_VOXELS = 0.1, 0.2
 
 # Patches that were hit a few times are narrow, and points beside them lie on the same surface. Up
 # to the first mean width of a cloud's patches, voxels, distances are those from planes. From the
@@ -66,7 +67,9 @@ class Match(NamedTuple):
     empty: jax.Array
 
 
-def match_points(field: Field | Baked, points_world: jax.Array, some: jax.Array) -> Match:
+def match_points(
+    field: Field | Baked, points_world: jax.Array, some: jax.Array, growing: jax.Array | float
+) -> Match:
     """Compares points with a map.
 
     A live map answers by its grid alone: the network changes no surface and costs more.
@@ -75,6 +78,7 @@ def match_points(field: Field | Baked, points_world: jax.Array, some: jax.Array)
         field: The map.
         points_world: (N, 3) m, finite.
         some: The row is a point, (N,) bool.
+        growing: How incomplete the map is, () from 0 to 1.
 
     Returns:
         The comparison. Differentiable by the points.
@@ -101,9 +105,13 @@ def match_points(field: Field | Baked, points_world: jax.Array, some: jax.Array)
         inside = jnp.all(points_world == geometry.clamp(config, points_world), axis=-1)
         free = depth < -_FREE_VOXELS * config.voxel_size
         empty = inside & free & (plane.away > _EMPTY_VOXELS * config.voxel_size)
-        inside &= plane.beside < _MOST_BESIDE_VOXELS * config.voxel_size
-        inside &= plane.width > _LEAST_WIDTH_VOXELS * config.voxel_size
-        share = _share_of_map(plane.width / config.voxel_size, some & inside)
+        beside, width = plane.beside / config.voxel_size, plane.width / config.voxel_size
+        inside &= (beside < _MOST_BESIDE_VOXELS[0]) & (width > _LEAST_WIDTH_VOXELS[0])
+        share = _share_of_map(width, some & inside)
+        # Where most patches are narrow, none can be left out.
+        strict = share * growing
+        inside &= beside < between(_MOST_BESIDE_VOXELS, strict)
+        inside &= width > between(_LEAST_WIDTH_VOXELS, strict)
         distance = share * distance + (1 - share) * plane.height
         normal = share * normal + (1 - share) * plane.normal
         spread = share * spread + (1 - share) * plane.spread
@@ -158,6 +166,11 @@ def _share_of_map(width: jax.Array, usable: jax.Array) -> jax.Array:
     total = jnp.sum(jnp.where(usable, jax.lax.stop_gradient(width), 0))
     mean = total / jnp.maximum(jnp.sum(usable), 1)
     return jnp.clip((mean - _NARROW_VOXELS) / (_WIDE_VOXELS - _NARROW_VOXELS), 0, 1)
+
+
+def between(limits: tuple[float, float], share: jax.Array | float) -> jax.Array | float:
+    """Returns the first limit at a share of 0, the second one at 1, and a mean in between."""
+    return limits[0] + share * (limits[1] - limits[0])
 
 
 def noise_of(field: Field | Baked) -> tuple[float, float]:

@@ -45,6 +45,11 @@ from hiosdf_jax._src.state import Baked, Field
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384
 
+GROWING_REACH_M = 0.2
+"""What `reach_m` is in a map that grows, m."""
+
+_COMPLETE_REACH_M = 0.7  # and in one that is complete
+
 
 class Registration(NamedTuple):
     """A pose that was refined by a map.
@@ -74,7 +79,7 @@ def refine_pose(
     prior: tuple[Any, Any] | None = None,
     *,
     noise: tuple[Any, Any] | None = None,
-    reach_m: Any = 0.7,
+    reach_m: Any = _COMPLETE_REACH_M,
 ) -> Registration:
     """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
 
@@ -93,7 +98,7 @@ def refine_pose(
             default it is `Config.range_noise` of the map; of a baked field, the default's.
         reach_m: How far surfaces may be from where they should be, m. The default suits a map that
             is complete. In one that grows, a wrong surface may be nearer than one that is missing:
-            `track` takes less.
+            `track` takes 0.2. With a smaller reach outliers also lose their weight sooner.
 
     Returns:
         The refined pose, and how far it can be trusted.
@@ -139,7 +144,9 @@ def _refine(
         cloud = jnp.where(near[:, None], jnp.nan, cloud)
     points, some = draw_evenly(cloud, _CANDIDATES)
     floor, growth = noise_of(field) if noise is None else noise
-    rows = make_rows(points, some, (jnp.float32(floor), jnp.float32(growth)))
+    range_noise = jnp.float32(floor), jnp.float32(growth)
+    growing = (_COMPLETE_REACH_M - reach_m) / (_COMPLETE_REACH_M - GROWING_REACH_M)
+    rows = make_rows(points, some, range_noise, jnp.clip(growing, 0, 1))
     anchor = Anchor(pose, None)
     if prior is not None:
         mean, covariance = (jnp.asarray(part, jnp.float32) for part in prior)
