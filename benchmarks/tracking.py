@@ -14,7 +14,6 @@
 - `jitter smoothed`: the same, smoothed afterwards with that deviation, and mapped again three times
 - `glitch`, `glitch left out`: five of them are off by 1 m, or those frames are missing
 - `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
-- `drift filtered`: the same, by `track_odometry`
 - `none`: only the first is used
 
 `--wrong-poses` refines each third frame from poses that are 1 m off, in the map before it.
@@ -52,7 +51,6 @@ MODES = (
     "glitch left out",
     "drift unrefined",
     "drift",
-    "drift filtered",
     "none",
 )
 DRIFT = 0.01, 0.05  # of the way, degrees per meter
@@ -91,7 +89,6 @@ def map_stream(frames, config, mode, seed=0):
     """Maps frames; returns the map, the poses at which they were fused, and who was refused."""
     given = change([pose for _, pose in frames], mode, seed)
     tracker = Tracker(odometry=mode == "none")
-    odometry = hio.start_odometry(given[0], given[0])
     state = hio.init(config, jax.random.key(0))
     poses, refused = [], []
     for i, (cloud, _) in enumerate(frames):
@@ -104,9 +101,6 @@ def map_stream(frames, config, mode, seed=0):
         elif mode.startswith("jitter"):
             known = (pose, JITTER_COVARIANCE) if mode == "jitter known" else None
             state, found = hio.track(state, cloud, pose, known)
-            pose, fused = found.pose, bool(found.converged)
-        elif mode == "drift filtered":
-            state, odometry, found = hio.track_odometry(state, cloud, odometry, pose)
             pose, fused = found.pose, bool(found.converged)
         else:
             state, pose = tracker.fuse(state, cloud, pose, i)

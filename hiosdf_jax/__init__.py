@@ -17,7 +17,6 @@ from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.joining.merging import correct, merge, transform
 from hiosdf_jax._src.mapping.lifecycle import grow, init, snapshot
 from hiosdf_jax._src.mapping.moving import moving_rows
-from hiosdf_jax._src.mapping.odometry import Odometry, start_odometry, track_odometry
 from hiosdf_jax._src.mapping.pipeline import pad_cloud, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
@@ -42,7 +41,6 @@ __all__ = [
     "Field",
     "Flag",
     "MapState",
-    "Odometry",
     "Query",
     "Registration",
     "Relocalization",
@@ -68,9 +66,7 @@ __all__ = [
     "sdf_and_grad",
     "smooth_poses",
     "snapshot",
-    "start_odometry",
     "track",
-    "track_odometry",
     "transform",
     "update",
     "view",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -80,41 +80,6 @@ def track(
         ...     predicted = hio.predict_pose(pose, before.pose, pose)
         ...     before, (state, found) = pose, hio.track(state, cloud, predicted)
     """
-    tried = try_pose(state, cloud, predicted_pose, prior, noise, reach_m)
-    return fuse_at(tried, tried.found.pose, donate), tried.found
-
-
-class Tried(NamedTuple):
-    """A cloud that was registered but not yet fused.
-
-    Attributes:
-        state: The map.
-        cloud: The cloud that `update` is given.
-        noise: Its checked noise, or None.
-        found: The registration, see `track`.
-        registered: Whether the cloud fits the map, () bool; a young map is given others, too.
-        flags: What registration raised.
-        traced: Whether an argument was a tracer.
-    """
-
-    state: MapState
-    cloud: jax.Array
-    noise: jax.Array | None
-    found: Registration
-    registered: jax.Array
-    flags: jax.Array
-    traced: bool
-
-
-def try_pose(
-    state: MapState,
-    cloud: Any,
-    predicted_pose: Any,
-    prior: tuple[Any, Any] | None,
-    noise: tuple[Any, Any] | None,
-    reach_m: Any,
-) -> Tried:
-    """Registers a cloud near its predicted pose; the arguments are those of `track`."""
     check_map(state)
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
@@ -128,16 +93,10 @@ def try_pose(
         fused_cloud, start = jax.device_put((padded, pose))
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
-    found, registered, flags = _register_jit(
-        state.updates, start, found, _covariance_of(prior), reach
-    )
-    return Tried(state, fused_cloud, checked_noise, found, registered, flags, traced)
-
-
-def fuse_at(tried: Tried, pose: jax.Array, donate: bool) -> MapState:
-    """Fuses a registered cloud at a pose (4, 4), or leaves the map as it was, with its flags."""
-    extras, donate = (None, tried.noise), donate and not tried.traced
-    return run_update(tried.state, tried.cloud, pose, extras, tried.flags, donate)
+    own = _covariance_of(prior)
+    found, flags_so_far = _register_jit(state.updates, start, found, own, reach)
+    extras, donate = (None, checked_noise), donate and not traced
+    return run_update(state, fused_cloud, found.pose, extras, flags_so_far, donate), found
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
@@ -208,11 +167,8 @@ def _register(
     found: Registration,
     own: jax.Array | None,
     reach_m: jax.Array,
-) -> tuple[Registration, jax.Array, jax.Array]:
-    """Decides whether a cloud is fused, and where.
-
-    Also returns whether it fits the map, and the flags that this raises.
-    """
+) -> tuple[Registration, jax.Array]:
+    """Decides whether a cloud is fused, and where; also returns the flags that this raises."""
     first = updates == 0
     near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
     registered = found.converged & near & ~first
@@ -225,7 +181,7 @@ def _register(
         covariance=jnp.where(registered, found.covariance, own),
         converged=fused,
     )
-    return chosen, registered, jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
+    return chosen, jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
 
 
 _register_jit = jax.jit(_register)
