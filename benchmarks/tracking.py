@@ -37,9 +37,10 @@ from benchmarks.registration import error, perturb
 from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
+from hiosdf_jax._src.mapping.registration.equations import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.judging import LEAST_INLIERS
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
-from hiosdf_jax._src.mapping.tracking import MOST_MOVED, REACH_M, prior_of_prediction
+from hiosdf_jax._src.mapping.tracking import MOST_MOVED, prior_of_prediction
 
 MODES = (
     "exact",
@@ -200,9 +201,9 @@ def print_wrong_poses(stream, frames, config):
 
 def _refine_from(state, cloud, start):
     """Refines a pose as `track` does; returns it, and whether it is as near as `track` demands."""
-    prior = prior_of_prediction(start, REACH_M)
-    found = hio.refine_pose(state, cloud, start, prior, reach_m=REACH_M)
-    return found, max(way_and_angle(found.pose, start)) <= MOST_MOVED * REACH_M
+    prior = prior_of_prediction(start, GROWING_REACH_M)
+    found = hio.refine_pose(state, cloud, start, prior, reach_m=GROWING_REACH_M)
+    return found, max(way_and_angle(found.pose, start)) <= MOST_MOVED * GROWING_REACH_M
 
 
 def print_relocalization(stream, frames, state, count, up_world):

@@ -69,9 +69,9 @@ print(f"after {way / 100:.0f} m the odometry is {distance_cm(odometry[-1], exact
 # odometry to the last refined pose, and the cloud is registered in the map near there.
 
 # %%
-believed = hio.init(config, jax.random.key(0))
+unrefined = hio.init(config, jax.random.key(0))
 for cloud, pose in zip(clouds, odometry, strict=True):
-    believed = hio.update(believed, cloud, pose)
+    unrefined = hio.update(unrefined, cloud, pose)
 
 state, found = hio.track(hio.init(config, jax.random.key(0)), clouds[0], odometry[0])
 tracked, reference = [found.pose], 0  # the last registered frame
@@ -112,7 +112,7 @@ def draw(axis, values, title):
     axis.set(title=title, xlabel="x [m]", aspect="equal", facecolor="0.8", xlim=(0, 10))
 
 
-drifted, corrected = slice_of(believed), slice_of(state)
+drifted, corrected = slice_of(unrefined), slice_of(state)
 figure, axes = plt.subplots(1, 2, figsize=(11, 4.4), dpi=90, sharey=True, layout="constrained")
 for axis, values, poses, name in (
     (axes[0], drifted, odometry, "odometry"),

@@ -22,7 +22,7 @@ def compared(field, cloud, pose, growing, scale_m=0.0):
 
 
 def returns():
-    """Of a sensor that is 3 cm beside the pose that is believed."""
+    """A cloud, and a pose that is 3 cm off along each axis."""
     cloud, pose = room_cloud(70, COUNT)
     pose = np.array(pose)
     pose[:3, 3] += 0.03

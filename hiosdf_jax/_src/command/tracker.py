@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hiosdf_jax._src.mapping.registration.equations import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
-from hiosdf_jax._src.mapping.tracking import REACH_M, predict_pose, track
+from hiosdf_jax._src.mapping.tracking import predict_pose, track
 from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.state import MapState
 from hiosdf_jax._src.view.paths import save_paths
@@ -79,7 +80,7 @@ class Tracker:
         """Registers a frame that the map is not given; returns the pose (4, 4)."""
         predicted = self.predict(given)
         return self._add(
-            frame, given, predicted, refine_pose(state, cloud, predicted, reach_m=REACH_M)
+            frame, given, predicted, refine_pose(state, cloud, predicted, reach_m=GROWING_REACH_M)
         )
 
     def counts(self) -> dict[str, int]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
+from hiosdf_jax._src.mapping.registration.equations import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
-    GROWING_REACH_M,
     Registration,
     checked_reach,
     refine_pose,
@@ -22,9 +22,6 @@ from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import Flag, MapState, check_map
-
-REACH_M = GROWING_REACH_M
-"""How far surfaces may be from where they should be, by default."""
 
 MOST_MOVED = 2.0
 """How far a pose may be moved from its prediction, as a share of `reach_m`, m and rad."""
@@ -43,7 +40,7 @@ def track(
     *,
     donate: bool = False,
     noise: tuple[Any, Any] | None = None,
-    reach_m: Any = REACH_M,
+    reach_m: Any = GROWING_REACH_M,
 ) -> tuple[MapState, Registration]:
     """Refines the predicted pose of a cloud by the map so far, and fuses the cloud there.
 

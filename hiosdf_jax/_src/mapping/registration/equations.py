@@ -17,6 +17,9 @@ from hiosdf_jax._src.mapping.registration.selection import even_steps
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 from hiosdf_jax._src.state import Baked, Field
 
+GROWING_REACH_M = 0.2
+"""How far surfaces may be from where they should be, in a map that grows."""
+
 INLIER_DEVIATIONS = 3.0
 """Returns within this many standard deviations of a surface lie on it."""
 
@@ -30,11 +33,10 @@ _LEAST_SIGMA_M = 0.006
 _ACROSS_RAD = 0.002
 
 # Returns this deep in unseen space are compared, m, and this many times what a coarse scale has
-# above the other length, m. Smaller scales track a sensor in a map that still grows: there, a
-# return in unseen space is of a surface that the map does not have.
+# above the reach in a map that grows. There, a return in unseen space is of a surface that the map
+# does not have.
 _DEEPEST_M = 0.1
 _DEEPEST_SCALES = 2.0
-_TRACKING_M = 0.2
 
 # A direction is free if the returns fit about as well where they are moved this far along it, m: if
 # their mean loss, which is at most 1, grows by less than this. Its slope alone does not tell: noise
@@ -150,7 +152,7 @@ def make_rows(
 
 
 def take_rows(rows: Rows, index: jax.Array | slice) -> Rows:
-    """Selects some of the rows; their typical range stays."""
+    """Selects some of the rows; what holds for the whole cloud stays."""
     return rows._replace(points=rows.points[index], sigma=rows.sigma[index], some=rows.some[index])
 
 
@@ -188,7 +190,8 @@ def compare(
     variance = along * rows.sigma**2 + (1 - along) * _ACROSS_RAD**2 * square
     variance += match.spread**2 + _LEAST_SIGMA_M**2
     comparable = rows.some & match.usable
-    comparable &= match.depth < jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - _TRACKING_M))
+    deepest = jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - GROWING_REACH_M))
+    comparable &= match.depth < deepest
     deviations = between(_OUTLIER_DEVIATIONS, rows.growing)
     sigma = jnp.sqrt(variance + (scale_m / deviations) ** 2)
     # The function of Geman and McClure.

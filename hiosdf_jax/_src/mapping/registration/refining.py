@@ -11,6 +11,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, as_field
 from hiosdf_jax._src.mapping.registration.equations import (
+    GROWING_REACH_M,
     Anchor,
     compare,
     make_rows,
@@ -45,10 +46,7 @@ from hiosdf_jax._src.state import Baked, Field
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384
 
-GROWING_REACH_M = 0.2
-"""What `reach_m` is in a map that grows, m."""
-
-_COMPLETE_REACH_M = 0.7  # and in one that is complete
+_COMPLETE_REACH_M = 0.7  # how far surfaces may be from where they should be, in a complete map
 
 
 class Registration(NamedTuple):
