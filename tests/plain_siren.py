@@ -1,9 +1,11 @@
-"""The SIREN and its gradient in numpy and float64, and samples to train it on."""
+"""The SIREN and its gradient in numpy and float64, samples, and GPU kernels on a CPU."""
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.network import evaluation
 from hiosdf_jax._src.samples.draw import Samples
 
 BOUNDS = ((-1, -1, -1), (1, 1, 1))
@@ -42,3 +44,13 @@ def some_samples(count=64, seed=0):
         jnp.asarray(0.5 - np.linalg.norm(points, axis=1), jnp.float32),
         jnp.asarray(np.arange(count) % 5 > 0, jnp.float32),
     )
+
+
+def interpret_kernels(monkeypatch, multiprocessors):
+    """Runs kernels for Hopper GPUs on the CPU."""
+    mosaic = pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
+    if not hasattr(mosaic, "InterpretGPUParams"):
+        pytest.skip("this jax cannot interpret GPU kernels")
+    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(evaluation, "INTERPRET", mosaic.InterpretGPUParams())
+    monkeypatch.setattr(evaluation, "multiprocessors", lambda: multiprocessors)

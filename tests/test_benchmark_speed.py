@@ -31,7 +31,7 @@ from benchmarks.speed import (
 from hiosdf_jax import datasets
 from hiosdf_jax._src.grid import nearest
 from hiosdf_jax._src.grid.windows import Window
-from hiosdf_jax._src.network import forward, siren, training
+from hiosdf_jax._src.network import forward, loss, siren, training
 from hiosdf_jax._src.numerics import shifts
 from hiosdf_jax._src.samples.draw import Samples
 
@@ -305,10 +305,10 @@ def test_work_is_what_xla_counts():
         return jax.jit(function).lower(*arguments).compile().cost_analysis()["flops"]
 
     def gradient(params):
-        def loss(params):
-            return sum(training.losses(config, params, points, samples))
+        def total(params):
+            return sum(loss.losses(config, params, points, samples))
 
-        return jax.grad(loss)(params)
+        return jax.grad(total)(params)
 
     # The residuals at the end of an update's training are no part of the gradient.
     once = limits.training_work(config).matrix - limits.network_query_work(config, 600).matrix / 2
@@ -374,7 +374,7 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     points = jax.random.uniform(jax.random.key(1), (100, 3), minval=-1)
     weight = (jnp.arange(100) % 4 > 0).astype(jnp.float32)
     samples = Samples(points, jnp.linalg.norm(points, axis=-1) - 0.5, weight)
-    parts = training.losses(config, network.params, points, samples)
+    parts = loss.losses(config, network.params, points, samples)
     weights = config.sdf_weight, config.eikonal_weight
     ours = weights[0] * parts.sdf + weights[1] * parts.eikonal
 
@@ -392,7 +392,7 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     trained, _, _ = training.train(
         config, network, samples, jnp.int32(0), jnp.float32(0), jax.random.key(2)
     )
-    after = training.losses(config, trained.params, points, samples)
+    after = loss.losses(config, trained.params, points, samples)
     ours_after = weights[0] * after.sdf + weights[1] * after.eikonal
     theirs_after = torch_siren.loss(model, *tensors, weights).item()
     assert theirs_after < 0.9 * theirs.item()

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plain_siren import BOUNDS, numpy_forward, numpy_gradient
+from plain_siren import BOUNDS, interpret_kernels, numpy_forward, numpy_gradient
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.network import evaluation, siren
 
-mosaic = pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
+pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
 
 
 def network(width, layers):
@@ -28,12 +28,8 @@ def relative(result, exact):
 @pytest.fixture
 def interpreted(monkeypatch):
     """Runs the kernel on the CPU, on one multiprocessor, for any number of rows."""
-    if not hasattr(mosaic, "InterpretGPUParams"):
-        pytest.skip("this jax cannot interpret GPU kernels")
-    monkeypatch.setattr(evaluation, "is_available", lambda: True)
-    monkeypatch.setattr(evaluation, "_INTERPRET", mosaic.InterpretGPUParams())
+    interpret_kernels(monkeypatch, multiprocessors=1)
     monkeypatch.setattr(evaluation, "_LEAST_ROWS", 1)
-    monkeypatch.setattr(evaluation, "_multiprocessors", lambda: 1)
 
 
 @pytest.mark.parametrize(("width", "layers", "rows"), [(128, 4, 200), (128, 1, 100), (256, 2, 65)])

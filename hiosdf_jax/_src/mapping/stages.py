@@ -19,7 +19,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches, rays, windows
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.mapping import calibration
-from hiosdf_jax._src.network import training
+from hiosdf_jax._src.network import loss, training
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.numerics.robot_and_noise import extras_are_valid
 from hiosdf_jax._src.samples import from_cloud, from_grid
@@ -81,7 +81,7 @@ class Step(NamedTuple):
     before: evidence.EvidenceWindow = _LATER
     window: evidence.EvidenceWindow = _LATER
     samples: Samples = _LATER
-    losses: training.Losses = _LATER
+    losses: loss.Losses = _LATER
     trained: jax.Array = _LATER
 
     @property

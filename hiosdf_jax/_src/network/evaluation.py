@@ -24,7 +24,7 @@ _MOST_LAYERS = 8  # more biases than that do not fit into shared memory
 _LEAST_ROWS = 8192  # fewer gain little, and the kernel takes seconds to compile
 _TRIED_BEFORE = (0, 13)  # jax changes its interface for GPU kernels from version to version
 
-_INTERPRET: Any = None  # the tests' way to run the kernel on a CPU
+INTERPRET: Any = None  # the tests' way to run the kernel on a CPU
 
 
 def value(frequency: float, params: Any, points: jax.Array) -> jax.Array:
@@ -38,7 +38,7 @@ def value(frequency: float, params: Any, points: jax.Array) -> jax.Array:
     Returns:
         (...) m. Without a derivative in reverse mode.
     """
-    function = _chosen_value if _has_kernel(params) else _value
+    function = _chosen_value if has_kernel(params) else _value
     return function(jnp.float32(frequency), params, points)
 
 
@@ -55,7 +55,7 @@ def value_and_gradient(
     Returns:
         The values (...) m and their gradients (..., 3). Without a derivative in reverse mode.
     """
-    function = _chosen_value_and_gradient if _has_kernel(params) else _value_and_gradient
+    function = _chosen_value_and_gradient if has_kernel(params) else _value_and_gradient
     return function(jnp.float32(frequency), params, points)
 
 
@@ -71,7 +71,8 @@ def is_available() -> bool:
     return len(devices) == 1 and jax.default_backend() == "gpu" and capability == _HOPPER
 
 
-def _has_kernel(params: Any) -> bool:
+def has_kernel(params: Any) -> bool:
+    """Returns whether a network has a shape for the kernels, and the device is one for them."""
     layers = forward.layers_of(params)
     widths = {kernel.shape[1] for kernel, _ in layers[:-1]}
     fits = len(widths) == 1 and widths <= set(_WIDTHS) and 3 <= len(layers) <= _MOST_LAYERS + 2
@@ -105,7 +106,7 @@ def _choose(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
     points = arguments[-1]
     if points.size < 3 * _LEAST_ROWS:
         return by_xla(*arguments)
-    if _INTERPRET is not None:
+    if INTERPRET is not None:
         return by_kernel(*arguments)
     return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
 
@@ -138,27 +139,39 @@ def _by_kernel(
 ) -> tuple[jax.Array, jax.Array]:
     from hiosdf_jax._src.network import hopper_kernel  # needs a jax with GPU kernels
 
-    layers = forward.layers_of(params)
-    (first, first_bias), *hidden, (last, last_bias) = layers
-    kernels, biases = (jnp.stack(parts) for parts in zip(*hidden, strict=True))
-    weights = (frequency * kernels).astype(jnp.float16)
-    if with_gradient:
-        weights = jnp.concatenate([weights, weights.transpose(0, 2, 1)[::-1]])
+    first, weights, biases, output = kernel_arguments(frequency, params)
+    if not with_gradient:
+        weights = weights[: weights.shape[0] // 2]
     rows = points.reshape(-1, 3)
     count = rows.shape[0]
     value, gradient = hopper_kernel.evaluate(
         jnp.pad(rows, ((0, -count % hopper_kernel.TILE), (0, 0))),
+        first,
+        weights,
+        biases,
+        output,
+        with_gradient=with_gradient,
+        multiprocessors=multiprocessors(),
+        interpret=INTERPRET,
+    )
+    value = value[:count].reshape(points.shape[:-1]) + forward.layers_of(params)[-1][1][0]
+    return value, gradient[:, :count].T.reshape(points.shape)
+
+
+def kernel_arguments(frequency: Any, params: Any) -> tuple[jax.Array, ...]:
+    """Returns `first`, `weights`, `biases` and `output` of `hopper_kernel.evaluate`."""
+    (first, first_bias), *hidden, (last, _) = forward.layers_of(params)
+    kernels, biases = (jnp.stack(parts) for parts in zip(*hidden, strict=True))
+    weights = (frequency * kernels).astype(jnp.float16)
+    weights = jnp.concatenate([weights, weights.transpose(0, 2, 1)[::-1]])
+    return (
         frequency * jnp.concatenate([first, first_bias[None]]),
         weights.reshape(-1, weights.shape[-1]),
         frequency * biases,
         last[:, 0],
-        with_gradient=with_gradient,
-        multiprocessors=_multiprocessors(),
-        interpret=_INTERPRET,
     )
-    value = value[:count].reshape(points.shape[:-1]) + last_bias[0]
-    return value, gradient[:, :count].T.reshape(points.shape)
 
 
-def _multiprocessors() -> int:
+def multiprocessors() -> int:
+    """Returns the number of the device's multiprocessors."""
     return getattr(jax.devices()[0], "core_count", 132)

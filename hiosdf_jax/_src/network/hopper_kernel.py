@@ -1,10 +1,8 @@
 """One kernel for a SIREN's values and gradients on a Hopper GPU (Pallas Mosaic GPU).
 
 XLA runs a kernel per layer, and each reads and writes all activations. Here activations stay on
-the chip. Each of two warpgroups takes 64 points through all layers and back. It holds the
-activations in registers as float16, and the tensor cores accumulate in float32. A third warpgroup
-streams the weights through shared memory. Shared memory has room for the cosines of one layer of
-256. The others wait in global memory.
+the chip, see `hopper_parts`. Shared memory has room for the cosines of one layer of 256. The others
+wait in global memory.
 
 On an H200 with jax 0.11.2, 102,400 values with gradients of four hidden layers take 0.28 ms at
 width 256 (XLA 0.68) and 0.13 ms at width 128 (XLA 0.36). Values alone take 0.13 and 0.08 ms (XLA
@@ -20,21 +18,24 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.experimental import pallas as pl
-from jax.experimental.pallas import mosaic_gpu
 
-gpu: Any = mosaic_gpu  # its types name no public constructors
-
-_ROWS = 64  # points of a warpgroup: the height of a Hopper matrix product
-_COLUMNS = 64  # neurons of a block: 128 bytes, the width of a swizzle
-_WARPGROUPS = 2  # that compute; one more streams the weights
-_STAGES = 4  # blocks of weights on their way
-TILE = _WARPGROUPS * _ROWS
-
-_LAYOUT = gpu.Layout.WGMMA
-_SWIZZLED = (gpu.TilingTransform((8, _COLUMNS)), gpu.SwizzleTransform(128))
-
-# Registers per thread. The streaming warpgroup gives its share to those that compute.
-_COMPUTING_REGISTERS, _STREAMING_REGISTERS = 240, 24
+from hiosdf_jax._src.network.hopper_parts import (
+    COLUMNS,
+    LAYOUT,
+    ROWS,
+    STAGES,
+    SWIZZLED,
+    TILE,
+    WARPGROUPS,
+    across,
+    gpu,
+    kernel,
+    load_column,
+    multiply,
+    part,
+    share_work,
+    spread,
+)
 
 
 def evaluate(
@@ -66,11 +67,11 @@ def evaluate(
         a gradient the second is undefined.
     """
     (layers, width), count = biases.shape, points.shape[0]
-    blocks = width // _COLUMNS
+    blocks = width // COLUMNS
     tiles = count // TILE
     grid = min(multiprocessors, tiles)
     steps = (2 if with_gradient else 1) * layers * blocks  # blocks of weights for each tile
-    stages = _STAGES if steps % _STAGES == 0 else 2
+    stages = STAGES if steps % STAGES == 0 else 2
     waiting = layers - 2 if with_gradient else 0  # layers whose cosines wait in global memory
 
     def body(
@@ -89,20 +90,13 @@ def evaluate(
         warpgroup, cell = lax.axis_index("warpgroup"), lax.axis_index("cell")
         turns = (tiles - cell + grid - 1) // grid
 
-        def spread(row: Any, block: int) -> jax.Array:
-            """A block of a row, for all points."""
-            place = row.at[pl.ds(block * _COLUMNS, _COLUMNS)]
-            part = gpu.load(place, layout=_LAYOUT.reduce(0))
-            return lax.broadcast_in_dim(part, (_ROWS, _COLUMNS), [1])
-
         def compute_tile(turn: jax.Array, _: None) -> None:
-            start = (turn * grid + cell) * TILE + warpgroup * _ROWS
+            start = (turn * grid + cell) * TILE + warpgroup * ROWS
             used = iter(range(steps))
             coordinates = []
             for axis in range(3):
-                place = points_ref.at[pl.ds(start, _ROWS), axis]
-                column = gpu.load(place, layout=_LAYOUT.reduce(1), optimized=False)
-                coordinates.append(lax.broadcast_in_dim(column, (_ROWS, _COLUMNS), [0]))
+                column = load_column(points_ref.at[pl.ds(start, ROWS), axis])
+                coordinates.append(across(column))
 
             def first_angle(block: int) -> jax.Array:
                 # Meters need all of float32.
@@ -118,36 +112,13 @@ def evaluate(
                 def slot(block: int) -> jax.Array:
                     return places[block] + 0 * turn  # jax 0.11 needs it to look traced
 
-                def accumulate(total: Any) -> jax.Array:
-                    for block in range(blocks):
-                        place = slot(block)
-                        gpu.barrier_wait(filled.at[place])
-                        gpu.wgmma(total, x[block], streamed.at[place])
-                        if block > 0:
-                            gpu.wgmma_wait(1)
-                            gpu.barrier_arrive(free.at[slot(block - 1)])
-                    result = total[...]
-                    gpu.barrier_arrive(free.at[slot(blocks - 1)])
-                    return result
-
-                if interpret is None:
-                    return pl.run_scoped(accumulate, gpu.ACC((_ROWS, width), jnp.float32))
-                total = jnp.zeros((_ROWS, width), jnp.float32)  # interpreted: no such products
-                for block in range(blocks):
-                    gpu.barrier_wait(filled.at[slot(block)])
-                    factor = streamed[slot(block)]
-                    total += jnp.dot(x[block], factor, preferred_element_type=jnp.float32)
-                    gpu.barrier_arrive(free.at[slot(block)])
-                return total
-
-            def part(x: jax.Array, block: int) -> jax.Array:
-                return x[:, block * _COLUMNS : (block + 1) * _COLUMNS]
+                return multiply(x, streamed, filled, free, slot, interpret)
 
             def cosine_block(block: int) -> Any:
-                return cosines.at[warpgroup, :, pl.ds(block * _COLUMNS, _COLUMNS)]
+                return cosines.at[warpgroup, :, pl.ds(block * COLUMNS, COLUMNS)]
 
             def waiting_place(layer: int) -> Any:
-                return waiting_ref.at[(cell * _WARPGROUPS + warpgroup) * waiting + layer]
+                return waiting_ref.at[(cell * WARPGROUPS + warpgroup) * waiting + layer]
 
             value: Any = None
             back: list[jax.Array] = []
@@ -183,7 +154,7 @@ def evaluate(
                     back = []
                     for block in range(blocks):
                         upstream = part(slope, block).astype(jnp.float16)
-                        back.append(upstream * gpu.load(cosine_block(block), layout=_LAYOUT))
+                        back.append(upstream * gpu.load(cosine_block(block), layout=LAYOUT))
                     if before >= 0:
                         gpu.commit_smem()
                         place = cosines.at[warpgroup]
@@ -200,7 +171,7 @@ def evaluate(
                     gradients.at[warpgroup, axis][...] = gradient[axis]
 
             gpu.commit_smem()
-            rows = pl.ds(start, _ROWS)
+            rows = pl.ds(start, ROWS)
             gpu.copy_smem_to_gmem(values.at[warpgroup], value_ref.at[rows])
             if with_gradient:
                 for axis in range(3):
@@ -208,78 +179,36 @@ def evaluate(
                     gpu.copy_smem_to_gmem(place, gradient_ref.at[axis, rows])
             gpu.wait_smem_to_gmem(0)
 
-        @pl.when(warpgroup < _WARPGROUPS)
-        def _() -> None:
-            gpu.set_max_registers(_COMPUTING_REGISTERS, action="increase")
-
-            @pl.when(warpgroup == 0)
-            def _() -> None:
-                gpu.copy_gmem_to_smem(first_ref, first_rows, loaded.at[0])
-                gpu.copy_gmem_to_smem(biases_ref, bias_rows, loaded.at[1])
-                gpu.copy_gmem_to_smem(output_ref, output_row, loaded.at[2])
-
-            for index in range(3):
-                gpu.barrier_wait(loaded.at[index])
-            lax.fori_loop(0, turns, compute_tile, None)
-
-        @pl.when(warpgroup == _WARPGROUPS)
-        def _() -> None:
-            gpu.set_max_registers(_STREAMING_REGISTERS, action="decrease")
-
-            def fetch(step: jax.Array, slot: Any) -> None:
-                start = lax.rem(step, jnp.int32(steps)) * _COLUMNS
-                block = weights_ref.at[pl.ds(start, _COLUMNS)]
-                gpu.copy_gmem_to_smem(block, streamed.at[slot], filled.at[slot])
-
-            def refill(step: jax.Array, _: None) -> None:
-                slot = lax.rem(step, jnp.int32(stages))
-                gpu.barrier_wait(free.at[slot])
-                fetch(step, slot)
-
-            def drain(step: jax.Array) -> None:
-                gpu.barrier_wait(free.at[lax.rem(step, jnp.int32(stages))])
-
-            for slot in range(stages):
-                fetch(jnp.int32(slot), slot)
-            lax.fori_loop(stages, turns * steps, refill, None)
-            if interpret is not None:  # jax 0.11 wants to see every arrival awaited
-                last = turns * steps
-                lax.fori_loop(last, last + stages, lambda step, _: drain(step), None)
+        constants = [(first_ref, first_rows), (biases_ref, bias_rows), (output_ref, output_row)]
+        barriers = (filled, free, loaded)
+        share_work(
+            compute_tile, turns, steps, constants, weights_ref, streamed, barriers, interpret
+        )
 
     def entry(*references: Any) -> None:
-        rows = _ROWS if with_gradient else 8
+        rows = ROWS if with_gradient else 8
         pl.run_scoped(
             lambda *scratch: body(*references, scratch=scratch),
-            gpu.SMEM((stages, _COLUMNS, width), jnp.float16, transforms=_SWIZZLED),
+            gpu.SMEM((stages, COLUMNS, width), jnp.float16, transforms=SWIZZLED),
             gpu.SMEM(first.shape, jnp.float32),
             gpu.SMEM(biases.shape, jnp.float32),
             gpu.SMEM(output.shape, jnp.float32),
-            gpu.SMEM((_WARPGROUPS, _ROWS), jnp.float32),
-            gpu.SMEM((_WARPGROUPS, 3, _ROWS), jnp.float32),
-            gpu.SMEM((_WARPGROUPS, rows, width), jnp.float16, transforms=_SWIZZLED),
+            gpu.SMEM((WARPGROUPS, ROWS), jnp.float32),
+            gpu.SMEM((WARPGROUPS, 3, ROWS), jnp.float32),
+            gpu.SMEM((WARPGROUPS, rows, width), jnp.float16, transforms=SWIZZLED),
             gpu.Barrier(num_barriers=stages),
-            gpu.Barrier(num_barriers=stages, num_arrivals=_WARPGROUPS),
+            gpu.Barrier(num_barriers=stages, num_arrivals=WARPGROUPS),
             gpu.Barrier(num_barriers=3),
-            gpu.Barrier(num_barriers=_WARPGROUPS),
+            gpu.Barrier(num_barriers=WARPGROUPS),
             collective_axes="warpgroup",
         )
 
-    places = max(grid * _WARPGROUPS * waiting, 1)
+    places = max(grid * WARPGROUPS * waiting, 1)
     results = [
         jax.ShapeDtypeStruct((count,), jnp.float32),
         jax.ShapeDtypeStruct((3, count), jnp.float32),
-        jax.ShapeDtypeStruct((places, _ROWS, width), jnp.float16),
+        jax.ShapeDtypeStruct((places, ROWS, width), jnp.float16),
     ]
-    options = {} if interpret is None else {"interpret": interpret}
-    kernel = gpu.kernel(
-        entry,
-        out_type=results,
-        grid=(grid,),
-        grid_names=("cell",),
-        num_threads=_WARPGROUPS + 1,
-        thread_name="warpgroup",
-        compiler_params=gpu.CompilerParams(approx_math=True),
-        **options,
-    )
-    value, gradient, _ = kernel(points, first, weights, biases, output)
+    run = kernel(entry, results, grid, interpret)
+    value, gradient, _ = run(points, first, weights, biases, output)
     return value, gradient

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ import numpy as np
 import optax
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.network import forward, siren, tiles
+from hiosdf_jax._src.network import derivatives, forward, loss, siren, tiles
+from hiosdf_jax._src.network.loss import Losses
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.samples.draw import Samples
@@ -22,18 +23,6 @@ from hiosdf_jax._src.state import Network
 # another world: the average then keeps at most this share of them.
 _CHANGED_WORLD = 0.02
 _CHANGED_AVERAGE = 0.5
-
-
-class Losses(NamedTuple):
-    """The two parts of the loss, before their weights.
-
-    Attributes:
-        sdf: Mean |f - s|, () m (equation 4).
-        eikonal: Mean | |grad f| - 1 |, () (equation 5).
-    """
-
-    sdf: jax.Array
-    eikonal: jax.Array
 
 
 def init_network(config: Config, key: jax.Array) -> Network:
@@ -53,21 +42,6 @@ def init_network(config: Config, key: jax.Array) -> Network:
         optimizer=_optimizer(config).init(params),
         origin_world=jnp.mean(jnp.asarray(config.bounds, jnp.float32), axis=0),
     )
-
-
-def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """Computes the losses over samples; the Eikonal loss takes the first group of them.
-
-    Args:
-        config: The map's configuration.
-        params: The network's weights.
-        points: (N, 3) the samples' points relative to the network's origin, m.
-        samples: The samples.
-
-    Returns:
-        Their means over the samples with weight.
-    """
-    return _means(_sums(config, params, points, samples), _weights(config, samples))
 
 
 def least_epochs(config: Config) -> int:
@@ -123,27 +97,20 @@ def train(
     optimizer = _optimizer(config)
     batches = _split(config, samples, key)
 
-    def objective(params: Any, tile: Samples, weights: Losses) -> tuple[jax.Array, Losses]:
-        points = tile.points_world - network.origin_world
-        sums = _sums(config, params, points, tile)
-        parts = _means(sums, weights)
-        loss = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
-        # A sum and not a mean: a single sample's share of the mean would vanish in float16.
-        return loss * _count(weights), sums
-
     def step(carry: tuple[Any, Any], batch: Samples) -> tuple[tuple[Any, Any], Losses]:
         params, state = carry
-        weights = _weights(config, batch)
+        weights = loss.weights(config, batch)
 
         def add(total: tuple[Any, Losses], tile: Samples) -> tuple[tuple[Any, Losses], None]:
-            part = jax.grad(objective, has_aux=True)(params, tile, weights)
+            points = tile.points_world - network.origin_world
+            part = derivatives.loss_gradient(config, params, points, tile, weights)
             return jax.tree.map(jnp.add, total, part), None
 
         nothing = varying_like(jax.tree.map(jnp.zeros_like, (params, weights)), params, batch)
         (gradients, sums), _ = jax.lax.scan(add, nothing, batch)
-        gradients = jax.tree.map(lambda gradient: gradient / _count(weights), gradients)
+        gradients = jax.tree.map(lambda gradient: gradient / loss.count(weights), gradients)
         updates, state = optimizer.update(gradients, state, params)
-        return (optax.apply_updates(params, updates), state), _means(sums, weights)
+        return (optax.apply_updates(params, updates), state), loss.means(sums, weights)
 
     def epoch(number: jax.Array, carry: tuple[Any, Any, Losses]) -> tuple[Any, Any, Losses]:
         (params, state), parts = jax.lax.scan(step, carry[:2], _turn(config, batches, number))
@@ -218,43 +185,10 @@ def _turn(config: Config, batches: Samples, epoch: jax.Array) -> Samples:
     """
     if config.eikonal_every == 1:
         return batches
-    size, sloped = batches.weight.shape[2], _sloped(config, batches)
+    size, sloped = batches.weight.shape[2], loss.sloped_rows(config, batches)
     turns = size // math.gcd(size, sloped)  # the rotation has this period
     places = -(epoch % turns) * sloped
     return jax.tree.map(lambda array: jnp.roll(array, places, axis=2), batches)
-
-
-def _sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """Computes the losses times the sums of `_weights`."""
-    sloped = _sloped(config, samples)
-    value, gradient = forward.value_and_gradient(config.frequency, params, points[:sloped])
-    if sloped < points.shape[0]:
-        others = forward.value(config.frequency, params, points[sloped:])
-        value = jnp.concatenate([value, others])
-    # Where the gradient is 0 its direction is undefined; 1e-12 keeps the derivative finite.
-    slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + 1e-12)
-    return Losses(
-        jnp.sum(jnp.abs(value - samples.sdf) * samples.weight),
-        jnp.sum(jnp.abs(slope - 1) * samples.weight[:sloped]),
-    )
-
-
-def _weights(config: Config, samples: Samples) -> Losses:
-    """Sums the weights of all (..., N) samples, and of those whose slope counts."""
-    sloped = samples.weight[..., : _sloped(config, samples)]
-    return Losses(jnp.sum(samples.weight), jnp.sum(sloped))
-
-
-def _sloped(config: Config, samples: Samples) -> int:
-    return -(-samples.weight.shape[-1] // config.eikonal_every)
-
-
-def _means(sums: Losses, weights: Losses) -> Losses:
-    return jax.tree.map(lambda total, weight: total / jnp.maximum(weight, 1), sums, weights)
-
-
-def _count(weights: Losses) -> jax.Array:
-    return jnp.maximum(weights.sdf, 1)
 
 
 def _median(values: jax.Array, weight: jax.Array) -> jax.Array:

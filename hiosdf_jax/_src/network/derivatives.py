@@ -1,0 +1,146 @@
+"""The gradient of the training loss: by one kernel on a Hopper GPU, else by XLA."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.network import evaluation, forward, loss
+from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.samples.draw import Samples
+
+_WIDTH = 128  # wider networks do not fit; see `hopper_training`
+_LEAST_ROWS = 8192  # fewer gain little, and the kernels take seconds to compile
+
+
+def loss_gradient(
+    config: Config, params: Any, points: jax.Array, samples: Samples, weights: loss.Losses
+) -> tuple[Any, loss.Losses]:
+    """Computes the gradient of the loss by the network's weights.
+
+    Args:
+        config: The map's configuration.
+        params: The network's weights.
+        points: (N, 3) the samples' points relative to the network's origin, m.
+        samples: N samples of a batch.
+        weights: The sums of the batch's weights, `loss.weights`.
+
+    Returns:
+        gradient: Of the loss times `loss.count(weights)`. A single sample's share of the mean would
+            vanish in float16.
+        sums: Of the losses, `loss.sums`.
+    """
+    arguments = (params, points, samples, weights)
+    by_xla = functools.partial(_by_xla, config)
+    fits = evaluation.has_kernel(params) and config.hidden_width == _WIDTH
+    if not fits or points.shape[0] < _LEAST_ROWS:
+        return by_xla(*arguments)
+    return _chosen(config, by_xla)(*jax.lax.stop_gradient(arguments))
+
+
+def _by_xla(
+    config: Config, params: Any, points: jax.Array, samples: Samples, weights: loss.Losses
+) -> tuple[Any, loss.Losses]:
+    def objective(params: Any) -> tuple[jax.Array, loss.Losses]:
+        sums = loss.sums(config, params, points, samples)
+        parts = loss.means(sums, weights)
+        total = config.sdf_weight * parts.sdf + config.eikonal_weight * parts.eikonal
+        return total * loss.count(weights), sums
+
+    return jax.grad(objective, has_aux=True)(params)
+
+
+def _chosen(config: Config, by_xla: Any) -> Any:
+    """Decides by the device when the program is compiled; several networks are left to XLA."""
+    by_kernel = functools.partial(_by_kernel, config)
+
+    @custom_vmap
+    def choose(*arguments: Any) -> Any:
+        if evaluation.INTERPRET is not None:
+            return by_kernel(*arguments)
+        return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
+
+    @choose.def_vmap
+    @plain  # traced again when a caller batches it, in the caller's modes
+    def _(size: int, batched: Any, *arguments: Any) -> Any:
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+        result = jax.vmap(by_xla, axes)(*arguments)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return choose
+
+
+def _by_kernel(
+    config: Config, params: Any, points: jax.Array, samples: Samples, weights: loss.Losses
+) -> tuple[Any, loss.Losses]:
+    from hiosdf_jax._src.network import hopper_training  # needs a jax with GPU kernels
+
+    network = evaluation.kernel_arguments(config.frequency, params)
+    sdf = config.sdf_weight * samples.weight
+    eikonal = loss.count(weights) / jnp.maximum(weights.eikonal, 1)
+    eikonal = config.eikonal_weight * eikonal * samples.weight
+    sloped = loss.sloped_rows(config, samples)
+    gradient, sums = None, loss.Losses(jnp.float32(0), jnp.float32(0))
+    for rows, with_slopes in ((slice(sloped), True), (slice(sloped, None), False)):
+        count = points[rows].shape[0]
+        if count == 0:
+            continue
+        padding = -count % hopper_training.TILE
+        wanted = samples.sdf - forward.layers_of(params)[-1][1][0]
+        targets = jnp.stack([wanted[rows], sdf[rows], eikonal[rows]])
+        padded = jnp.pad(points[rows], ((0, padding), (0, 0)))
+        targets = jnp.pad(targets, ((0, 0), (0, padding)))
+        factors = hopper_training.factors(
+            padded,
+            targets,
+            *network,
+            with_slopes=with_slopes,
+            multiprocessors=evaluation.multiprocessors(),
+            interpret=evaluation.INTERPRET,
+        )
+        part = _multiply(config, padded, targets, factors)
+        gradient = part if gradient is None else jax.tree.map(jnp.add, gradient, part)
+        weight = samples.weight[rows]
+        error = jnp.sum(jnp.abs(factors.value[:count] - wanted[rows]) * weight)
+        slope = jnp.abs(_slope(factors.gradient[:, :count]) - 1) if with_slopes else 0
+        sums = loss.Losses(sums.sdf + error, sums.eikonal + jnp.sum(slope * weight))
+    return gradient, sums
+
+
+def _slope(gradient: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(gradient**2, axis=0) + loss.LEAST_SQUARE)
+
+
+def _multiply(config: Config, points: jax.Array, targets: jax.Array, factors: Any) -> Any:
+    """Computes the gradient of the weights from its factors; see `hopper_training.Factors`."""
+    wanted, sdf, eikonal = targets
+    hidden = jnp.einsum(
+        "lpnd,lpne->lde", factors.inputs, factors.angles, preferred_element_type=jnp.float32
+    )
+    biases = jnp.sum(factors.angles[:, 0], axis=1, dtype=jnp.float32)
+    by_angle = factors.first[0].astype(jnp.float32)
+    by_value = jnp.where(factors.value < wanted, -sdf, sdf)
+    # Meters need all of float32: written out, no tensor core rounds them.
+    first = [jnp.sum(points[:, axis, None] * by_angle, axis=0) for axis in range(3)]
+    last = jnp.sum(by_value[:, None] * factors.last[0].astype(jnp.float32), axis=0)
+    if factors.last.shape[0] > 1:  # with slopes
+        slope = _slope(factors.gradient)
+        by_gradient = jnp.where(slope < 1, -eikonal, eikonal) / slope * factors.gradient
+        back = factors.first[1].astype(jnp.float32)
+        first = [
+            total + jnp.sum(by_gradient[axis, :, None] * back, axis=0)
+            for axis, total in enumerate(first)
+        ]
+        last = last + jnp.sum(factors.last[1].astype(jnp.float32), axis=0)
+    # The kernel's weights, but for the last layer's, are multiplied by omega_0.
+    kernels = [config.frequency * kernel for kernel in (jnp.stack(first), *hidden)]
+    by_bias = [config.frequency * bias for bias in (jnp.sum(by_angle, axis=0), *biases)]
+    kernels.append(last[:, None])
+    by_bias.append(jnp.sum(by_value)[None])
+    layers = zip(kernels, by_bias, strict=True)
+    return {"params": {f"Dense_{k}": {"kernel": w, "bias": b} for k, (w, b) in enumerate(layers)}}
