@@ -14,6 +14,7 @@
 - `jitter smoothed`: the same, smoothed afterwards with that deviation, and mapped again three times
 - `glitch`, `glitch left out`: five of them are off by 1 m, or those frames are missing
 - `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
+- `drift known`: the same, and what they predict is a prior: 3 mm and 0.1 degrees per axis
 - `none`: only the first is used
 
 `--wrong-poses` refines each third frame from poses that are 1 m off, in the map before it.
@@ -52,9 +53,11 @@ MODES = (
     "glitch left out",
     "drift unrefined",
     "drift",
+    "drift known",
     "none",
 )
 DRIFT = 0.01, 0.05  # of the way, degrees per meter
+STEP_COVARIANCE = np.diag(np.repeat([0.003, np.radians(0.1)], 3) ** 2)
 JITTER = 0.02, 1.0  # m, degrees
 JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 2 / 3)
 MAPPED_AGAIN = 3
@@ -104,7 +107,8 @@ def map_stream(frames, config, mode, seed=0):
             state, found = hio.track(state, cloud, pose, known)
             pose, fused = found.pose, bool(found.converged)
         else:
-            state, pose = tracker.fuse(state, cloud, pose, i)
+            covariance = STEP_COVARIANCE if mode == "drift known" else None
+            state, pose = tracker.fuse(state, cloud, pose, i, covariance)
             fused = tracker.frames[-1].registered
         poses.append(np.asarray(pose))
         if not fused:
@@ -239,6 +243,7 @@ def main():
     parser.add_argument("--stream", type=Path, required=True, help="a recording, or demo")
     parser.add_argument("--poses", choices=MODES, nargs="*", default=[], help="see above")
     parser.add_argument("--seed", type=int, default=0, help="of the jitter")
+    parser.add_argument("--order", type=int, default=0, help="seed to shuffle the clouds' rows by")
     parser.add_argument("--relocalize", type=int, default=0, help="frames to find")
     parser.add_argument("--wrong-poses", action="store_true", help="see above")
     parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
@@ -257,6 +262,9 @@ def main():
         truth = datasets.read_truth(arguments.stream)
     config = hio.Config.light(bounds, max_range=max_range)
     frames = [stream[i] for i in range(arguments.frames or len(stream))]
+    if arguments.order:
+        order = np.random.default_rng(arguments.order)
+        frames = [(order.permutation(cloud), pose) for cloud, pose in frames]
     name = arguments.stream.stem
     for mode in arguments.poses:
         print_tracking(name, frames, config, truth, mode, arguments.seed)
