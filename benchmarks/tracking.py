@@ -94,7 +94,7 @@ def map_stream(frames, config, mode, seed=0):
     given = change([pose for _, pose in frames], mode, seed)
     tracker = Tracker(odometry=mode == "none")
     state = hio.init(config, jax.random.key(0))
-    poses, refused = [], []
+    poses, refused, last = [], [], 0  # the last registered frame
     for i, (cloud, _) in enumerate(frames):
         pose, fused = given[i], True
         if mode == "glitch left out" and i in GLITCH:
@@ -102,13 +102,17 @@ def map_stream(frames, config, mode, seed=0):
             continue
         if mode == "exact" or mode.endswith("unrefined"):
             state = hio.update(state, cloud, pose)
+        elif mode == "drift known":
+            predicted = hio.predict_pose(poses[last], given[last], pose) if i else pose
+            state, found = hio.track(state, cloud, predicted, (predicted, STEP_COVARIANCE))
+            pose, fused = found.pose, bool(found.converged)
+            last = i if fused else last
         elif mode.startswith("jitter"):
             known = (pose, JITTER_COVARIANCE) if mode == "jitter known" else None
             state, found = hio.track(state, cloud, pose, known)
             pose, fused = found.pose, bool(found.converged)
         else:
-            covariance = STEP_COVARIANCE if mode == "drift known" else None
-            state, pose = tracker.fuse(state, cloud, pose, i, covariance)
+            state, pose = tracker.fuse(state, cloud, pose, i)
             fused = tracker.frames[-1].registered
         poses.append(np.asarray(pose))
         if not fused:

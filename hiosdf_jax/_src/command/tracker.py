@@ -67,20 +67,11 @@ class Tracker:
         return np.asarray(predict_pose(last.pose, before.pose, last.pose))
 
     def fuse(
-        self,
-        state: MapState,
-        cloud: np.ndarray,
-        given: np.ndarray,
-        frame: int,
-        covariance: np.ndarray | None = None,
+        self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
     ) -> tuple[MapState, np.ndarray]:
-        """Registers a frame and fuses it if it fits; returns the map and the pose (4, 4).
-
-        The covariance (6, 6) is that of the prediction's error, m and rad, if it is known.
-        """
+        """Registers a frame and fuses it if it fits; returns the map and the pose (4, 4)."""
         predicted = self.predict(given)
-        prior = None if covariance is None else (predicted, covariance)
-        state, found = track(state, cloud, predicted, prior)
+        state, found = track(state, cloud, predicted)
         return state, self._add(frame, given, predicted, found)
 
     def locate(

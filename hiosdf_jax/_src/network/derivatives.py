@@ -61,15 +61,12 @@ def _chosen(config: Config, by_xla: Any) -> Any:
 
     @custom_vmap
     def choose(*arguments: Any) -> Any:
-        if evaluation.INTERPRET is not None:
-            return by_kernel(*arguments)
-        return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
+        return evaluation.choose_by_device(by_kernel, by_xla, *arguments)
 
     @choose.def_vmap
     @plain  # traced again when a caller batches it, in the caller's modes
     def _(size: int, batched: Any, *arguments: Any) -> Any:
-        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
-        result = jax.vmap(by_xla, axes)(*arguments)
+        result = evaluation.batch_by_xla(by_xla, batched, arguments)
         return result, jax.tree.map(lambda _: True, result)
 
     return choose
@@ -81,39 +78,41 @@ def _by_kernel(
     from hiosdf_jax._src.network import hopper_training  # needs a jax with GPU kernels
 
     network = evaluation.kernel_arguments(config.frequency, params)
-    sdf = config.sdf_weight * samples.weight
-    eikonal = loss.count(weights) / jnp.maximum(weights.eikonal, 1)
-    eikonal = config.eikonal_weight * eikonal * samples.weight
+    share = loss.count(weights) / jnp.maximum(weights.eikonal, 1)
+    targets = jnp.stack(
+        [
+            samples.sdf - forward.layers_of(params)[-1][1][0],
+            config.sdf_weight * samples.weight,
+            config.eikonal_weight * share * samples.weight,
+        ]
+    )
     sloped = loss.sloped_rows(config, samples)
     gradient, sums = None, loss.Losses(jnp.float32(0), jnp.float32(0))
     for rows, with_slopes in ((slice(sloped), True), (slice(sloped, None), False)):
-        count = points[rows].shape[0]
+        wanted, weight = targets[0, rows], samples.weight[rows]
+        count = len(weight)
         if count == 0:
             continue
-        padding = -count % hopper_training.TILE
-        wanted = samples.sdf - forward.layers_of(params)[-1][1][0]
-        targets = jnp.stack([wanted[rows], sdf[rows], eikonal[rows]])
-        padded = jnp.pad(points[rows], ((0, padding), (0, 0)))
-        targets = jnp.pad(targets, ((0, 0), (0, padding)))
+        padding = (0, -count % hopper_training.TILE)
+        padded = jnp.pad(points[rows], (padding, (0, 0)))
+        padded_targets = jnp.pad(targets[:, rows], ((0, 0), padding))
         factors = hopper_training.factors(
             padded,
-            targets,
+            padded_targets,
             *network,
             with_slopes=with_slopes,
             multiprocessors=evaluation.multiprocessors(),
             interpret=evaluation.INTERPRET,
         )
-        part = _multiply(config, padded, targets, factors)
+        part = _multiply(config, padded, padded_targets, factors)
         gradient = part if gradient is None else jax.tree.map(jnp.add, gradient, part)
-        weight = samples.weight[rows]
-        error = jnp.sum(jnp.abs(factors.value[:count] - wanted[rows]) * weight)
-        slope = jnp.abs(_slope(factors.gradient[:, :count]) - 1) if with_slopes else 0
-        sums = loss.Losses(sums.sdf + error, sums.eikonal + jnp.sum(slope * weight))
+        error = jnp.abs(factors.value[:count] - wanted)
+        slope = loss.slope_of(factors.gradient[:, :count], axis=0) if with_slopes else 1.0
+        sums = loss.Losses(
+            sums.sdf + jnp.sum(error * weight),
+            sums.eikonal + jnp.sum(jnp.abs(slope - 1) * weight),
+        )
     return gradient, sums
-
-
-def _slope(gradient: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(gradient**2, axis=0) + loss.LEAST_SQUARE)
 
 
 def _multiply(config: Config, points: jax.Array, targets: jax.Array, factors: Any) -> Any:
@@ -129,7 +128,7 @@ def _multiply(config: Config, points: jax.Array, targets: jax.Array, factors: An
     first = [jnp.sum(points[:, axis, None] * by_angle, axis=0) for axis in range(3)]
     last = jnp.sum(by_value[:, None] * factors.last[0].astype(jnp.float32), axis=0)
     if factors.last.shape[0] > 1:  # with slopes
-        slope = _slope(factors.gradient)
+        slope = loss.slope_of(factors.gradient, axis=0)
         by_gradient = jnp.where(slope < 1, -eikonal, eikonal) / slope * factors.gradient
         back = factors.first[1].astype(jnp.float32)
         first = [

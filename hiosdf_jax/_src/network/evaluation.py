@@ -106,9 +106,20 @@ def _choose(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
     points = arguments[-1]
     if points.size < 3 * _LEAST_ROWS:
         return by_xla(*arguments)
+    return choose_by_device(by_kernel, by_xla, *arguments)
+
+
+def choose_by_device(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
+    """Runs a kernel on a Hopper GPU, else XLA. The device is known when the program is compiled."""
     if INTERPRET is not None:
         return by_kernel(*arguments)
     return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
+
+
+def batch_by_xla(by_xla: Any, batched: Any, arguments: Any) -> Any:
+    """Evaluates several networks at once; `batched` says which arguments have a first axis more."""
+    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+    return jax.vmap(by_xla, axes)(*arguments)
 
 
 def _batching(function: Any, by_xla: Any) -> Any:
@@ -118,8 +129,7 @@ def _batching(function: Any, by_xla: Any) -> Any:
     @plain  # traced again when a caller batches it, in the caller's modes
     def of_batch(size: int, batched: Any, *arguments: Any) -> Any:
         if any(jax.tree.leaves(batched[:2])):
-            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
-            result = jax.vmap(by_xla, axes)(*arguments)
+            result = batch_by_xla(by_xla, batched, arguments)
         else:
             result = wrapped(*arguments)
         return result, jax.tree.map(lambda _: True, result)

@@ -27,12 +27,12 @@ from hiosdf_jax._src.network.hopper_parts import (
     SWIZZLED,
     TILE,
     WARPGROUPS,
-    across,
+    first_angle_at,
     gpu,
     kernel,
-    load_column,
     multiply,
     part,
+    send_results,
     share_work,
     spread,
 )
@@ -93,17 +93,7 @@ def evaluate(
         def compute_tile(turn: jax.Array, _: None) -> None:
             start = (turn * grid + cell) * TILE + warpgroup * ROWS
             used = iter(range(steps))
-            coordinates = []
-            for axis in range(3):
-                column = load_column(points_ref.at[pl.ds(start, ROWS), axis])
-                coordinates.append(across(column))
-
-            def first_angle(block: int) -> jax.Array:
-                # Meters need all of float32.
-                angle = spread(first_rows.at[3], block)
-                for axis in range(3):
-                    angle = angle + coordinates[axis] * spread(first_rows.at[axis], block)
-                return angle
+            first_angle = first_angle_at(points_ref, first_rows, start)
 
             def product(x: list[jax.Array]) -> jax.Array:
                 """Multiplies (64, D), in blocks of columns, by the next (D, D) of weights."""
@@ -170,14 +160,8 @@ def evaluate(
                 for axis in range(3):
                     gradients.at[warpgroup, axis][...] = gradient[axis]
 
-            gpu.commit_smem()
-            rows = pl.ds(start, ROWS)
-            gpu.copy_smem_to_gmem(values.at[warpgroup], value_ref.at[rows])
-            if with_gradient:
-                for axis in range(3):
-                    place = gradients.at[warpgroup, axis]
-                    gpu.copy_smem_to_gmem(place, gradient_ref.at[axis, rows])
-            gpu.wait_smem_to_gmem(0)
+            slopes = (gradients, gradient_ref) if with_gradient else None
+            send_results(warpgroup, start, (values, value_ref), slopes)
 
         constants = [(first_ref, first_rows), (biases_ref, bias_rows), (output_ref, output_row)]
         barriers = (filled, free, loaded)

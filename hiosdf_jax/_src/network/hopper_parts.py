@@ -53,6 +53,46 @@ def part(x: jax.Array, block: int) -> jax.Array:
     return x[:, block * COLUMNS : (block + 1) * COLUMNS]
 
 
+def first_angle_at(points: Any, first_rows: Any, start: jax.Array) -> Callable[[int], jax.Array]:
+    """Loads 64 points, and returns what computes the input layer's angles there, block by block.
+
+    Args:
+        points: Points in global memory, (N, 3) float32, m.
+        first_rows: The input layer's three rows of weights and its bias, (4, D) float32.
+        start: Number of the first point, () int32.
+    """
+    coordinates = [across(load_column(points.at[pl.ds(start, ROWS), axis])) for axis in range(3)]
+
+    def first_angle(block: int) -> jax.Array:
+        # Meters need all of float32.
+        angle = spread(first_rows.at[3], block)
+        for axis in range(3):
+            angle = angle + coordinates[axis] * spread(first_rows.at[axis], block)
+        return angle
+
+    return first_angle
+
+
+def send_results(
+    warpgroup: jax.Array, start: Any, values: tuple[Any, Any], gradients: tuple[Any, Any] | None
+) -> None:
+    """Sends a warpgroup's values, and gradients if there are any, and waits until all is sent.
+
+    Args:
+        warpgroup: Its number, () int32.
+        start: Number of its first point, () int32.
+        values: Their places in shared memory, (warpgroups, 64), and in global memory, (N,).
+        gradients: Likewise, (warpgroups, 3, 64) and (3, N); None without them.
+    """
+    rows = pl.ds(start, ROWS)
+    gpu.commit_smem()
+    gpu.copy_smem_to_gmem(values[0].at[warpgroup], values[1].at[rows])
+    if gradients is not None:
+        for axis in range(3):
+            gpu.copy_smem_to_gmem(gradients[0].at[warpgroup, axis], gradients[1].at[axis, rows])
+    gpu.wait_smem_to_gmem(0)
+
+
 def multiply(
     x: Any,
     streamed: Any,

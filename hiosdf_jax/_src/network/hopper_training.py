@@ -38,14 +38,17 @@ from hiosdf_jax._src.network.hopper_parts import (
     TILE,
     WARPGROUPS,
     across,
+    first_angle_at,
     gpu,
     kernel,
     load_column,
     multiply,
     part,
+    send_results,
     share_work,
     spread,
 )
+from hiosdf_jax._src.network.loss import LEAST_SQUARE
 
 Blocks = tuple[jax.Array, ...]  # (64, D) float16, in blocks of columns
 
@@ -195,16 +198,7 @@ def factors(
                 return lax.fori_loop(jnp.int32(begin), jnp.int32(end), step, x)
 
             # Pass 1.
-            coordinates = [
-                across(load_column(points_ref.at[pl.ds(start, ROWS), axis])) for axis in range(3)
-            ]
-
-            def first_angle(block: int) -> jax.Array:
-                # Meters need all of float32.
-                angle = spread(first_rows.at[3], block)
-                for axis in range(3):
-                    angle = angle + coordinates[axis] * spread(first_rows.at[axis], block)
-                return angle
+            first_angle = first_angle_at(points_ref, first_rows, start)
 
             def activate(layer: Any, angle_of: Callable[[int], jax.Array]) -> Blocks:
                 await_room()
@@ -275,7 +269,7 @@ def factors(
                         gradient[axis] += (r * spread(first_rows.at[axis], block)).sum(axis=1)
                 for axis in range(3):
                     gradients.at[warpgroup, axis][...] = gradient[axis]
-                slope = jnp.sqrt(sum((g * g for g in gradient), 1e-12))
+                slope = jnp.sqrt(sum((g * g for g in gradient), LEAST_SQUARE))
                 by_slope = jnp.where(slope < 1, -slope_weight, slope_weight) / slope
                 by_gradient = [across(by_slope * g) for g in gradient]
 
@@ -346,13 +340,8 @@ def factors(
             fetch_for_pass_4(jnp.int32(layers - 1))
             loop(0, layers, finish, back)
 
-            gpu.commit_smem()
-            gpu.copy_smem_to_gmem(values.at[warpgroup], value_ref.at[pl.ds(start, ROWS)])
-            if with_slopes:
-                for axis in range(3):
-                    place = gradients.at[warpgroup, axis]
-                    gpu.copy_smem_to_gmem(place, gradient_ref.at[axis, pl.ds(start, ROWS)])
-            await_sent()
+            slopes = (gradients, gradient_ref) if with_slopes else None
+            send_results(warpgroup, start, (values, value_ref), slopes)
 
         constants = [(first_ref, first_rows), (biases_ref, bias_rows), (output_ref, output_row)]
         barriers = (filled, free, loaded)

@@ -49,11 +49,16 @@ def sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Lo
     if sloped < points.shape[0]:
         others = forward.value(config.frequency, params, points[sloped:])
         value = jnp.concatenate([value, others])
-    slope = jnp.sqrt(jnp.sum(gradient**2, axis=-1) + LEAST_SQUARE)
+    slope = slope_of(gradient)
     return Losses(
         jnp.sum(jnp.abs(value - samples.sdf) * samples.weight),
         jnp.sum(jnp.abs(slope - 1) * samples.weight[:sloped]),
     )
+
+
+def slope_of(gradient: jax.Array, axis: int = -1) -> jax.Array:
+    """Computes the length of gradients; its derivative is finite everywhere."""
+    return jnp.sqrt(jnp.sum(gradient**2, axis=axis) + LEAST_SQUARE)
 
 
 def weights(config: Config, samples: Samples) -> Losses:
