@@ -32,7 +32,7 @@ from hiosdf_jax import datasets
 from hiosdf_jax._src.grid import nearest
 from hiosdf_jax._src.grid.windows import Window
 from hiosdf_jax._src.network import forward, loss, siren, training
-from hiosdf_jax._src.numerics import shifts
+from hiosdf_jax._src.numerics import loops
 from hiosdf_jax._src.samples.draw import Samples
 
 # The same map as that of other tests, so that its update is compiled once for them all.
@@ -319,7 +319,7 @@ def test_work_is_what_xla_counts():
 
 def test_the_distance_transform_s_work_is_what_xla_is_given(monkeypatch):
     # Without a loop, whose work XLA counts once.
-    monkeypatch.setattr(shifts, "_UNROLL", 12)
+    monkeypatch.setattr(loops, "_UNROLL", 12)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     window = Window((5, 0, 0), (30, 30, 20), (8, 2, 0), (20, 24, 20))
     part = nearest.Part(window.within, window.inner_shape)

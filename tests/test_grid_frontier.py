@@ -11,7 +11,7 @@ from room import BOUNDS, CONFIG
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid import frontier, geometry
 from hiosdf_jax._src.grid.evidence import is_observed
-from hiosdf_jax._src.numerics import shifts
+from hiosdf_jax._src.numerics import loops
 
 signed_box_distance = jax.jit(frontier.signed_box_distance, static_argnums=1)
 
@@ -48,7 +48,7 @@ def test_steps_of_several_shifts_find_the_same(monkeypatch, number):
     """As a GPU takes them, where they do and do not divide all shifts."""
     inside = jnp.asarray(np.random.default_rng(3).random((7, 12, 9)) < 0.9)
     expected = np.asarray(signed_box_distance(inside, 8))
-    monkeypatch.setattr(shifts, "_UNROLL", number)
+    monkeypatch.setattr(loops, "_UNROLL", number)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     search = jax.jit(lambda inside: frontier.signed_box_distance(inside, 8))
     np.testing.assert_array_equal(np.asarray(search(inside)), expected)

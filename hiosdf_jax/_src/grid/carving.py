@@ -7,6 +7,8 @@ length of the ray inside the voxel, in voxels.
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -24,9 +26,12 @@ _MARGIN_VOXELS = 1.0
 # Hidden space is marked from half a voxel behind the end of a ray, in this many steps of a voxel.
 _BEHIND_STEPS = HIDDEN_VOXELS - 1
 
-# Steps per loop iteration. Few, large kernels: a GPU waits for the host at the end of each
-# iteration, and holds this many points of every ray in memory at once.
+# Steps per loop iteration. Few, large kernels, which hold this many points of every ray in memory.
 _CHUNK = 32
+
+# A GPU makes all that the longest possible ray needs, if they are at most this many. It waits for
+# the host at each iteration of a loop of unknown length.
+_MOST_CHUNKS = 16
 
 
 def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWindow:
@@ -62,11 +67,13 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
         steps = done + jnp.arange(_CHUNK, dtype=jnp.float32) + phase[:, None]
         return done + _CHUNK, count(passes, steps, steps < free[:, None])
 
-    _, passes = jax.lax.while_loop(
-        lambda carry: carry[0] < longest,
-        advance,
-        varying_like((jnp.float32(0), jnp.zeros(voxels, window.passes.dtype)), rays, window),
-    )
+    start = (jnp.float32(0), jnp.zeros(voxels, window.passes.dtype))
+    start = varying_like(start, rays, window)
+    chunks = math.ceil(config.max_range / size / _CHUNK)
+    if jax.default_backend() == "cpu" or chunks > _MOST_CHUNKS:
+        _, passes = jax.lax.while_loop(lambda carry: carry[0] < longest, advance, start)
+    else:
+        _, passes = jax.lax.fori_loop(0, chunks, lambda _, carry: advance(carry), start)
     passes = passes.reshape(shape)
     # A hidden voxel (negative) that rays pass again is observed.
     passes = jnp.where(passes > 0, jnp.abs(window.passes) + passes, window.passes)

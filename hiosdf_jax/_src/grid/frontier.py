@@ -10,8 +10,9 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
+from hiosdf_jax._src.numerics.loops import unroll
 from hiosdf_jax._src.numerics.modes import varying_like
-from hiosdf_jax._src.numerics.shifts import hold, pad_axis, unroll
+from hiosdf_jax._src.numerics.shifts import hold, pad_axis
 from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
 
 _INFINITE = 1e12  # squared voxels

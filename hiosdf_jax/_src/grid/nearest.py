@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.loops import unroll
 from hiosdf_jax._src.numerics.modes import varying_like
-from hiosdf_jax._src.numerics.shifts import hold, pad_axis, unroll
+from hiosdf_jax._src.numerics.shifts import hold, pad_axis
 
 _INFINITE = 1e12  # squared voxels
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from hiosdf_jax._src.numerics.modes import cond
 
-_UNROLL = 8  # shifts in either direction, so that a GPU starts fewer kernels
-
 
 class Padded(NamedTuple):
     """An array with a margin at both ends of one axis.
@@ -63,14 +61,6 @@ def hold(padded: Padded) -> Padded:
     if jax.default_backend() == "cpu":
         return padded
     return padded._replace(values=jax.lax.optimization_barrier(padded.values))
-
-
-def unroll() -> int:
-    """Returns how many shifts a loop over them takes per step: few, large steps suit a GPU.
-
-    A CPU takes one, which compiles faster and runs as fast.
-    """
-    return 1 if jax.default_backend() == "cpu" else _UNROLL
 
 
 def with_neighbors(mask: jax.Array) -> jax.Array:

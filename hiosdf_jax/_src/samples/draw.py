@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-_WORD = 32  # bits
+from hiosdf_jax._src.numerics.masks import rank_mask, true_elements
 
 
 class Samples(NamedTuple):
@@ -44,35 +44,9 @@ def draw_from_mask(mask: jax.Array, count: int, key: jax.Array) -> tuple[jax.Arr
         index: Indices into the raveled mask, (count,) int32.
         possible: Whether any element is True, () bool; the indices are undefined otherwise.
     """
-    words = _words(mask.ravel())
-    rank = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
-    total = rank[-1]
+    ranked = rank_mask(mask)
     # `randint` has no bias of total / 2^32, and takes three times as long to compile.
     bits = jax.random.bits(key, (count,), jnp.uint32)
-    chosen = (bits % jnp.maximum(total, 1).astype(jnp.uint32)).astype(jnp.int32)
-    # On a GPU the unrolled steps are one kernel; on a CPU each is compiled by itself.
-    method = "scan" if jax.default_backend() == "cpu" else "scan_unrolled"
-    row = jnp.searchsorted(rank, chosen + 1, method=method)
-    row = jnp.minimum(row, words.size - 1).astype(jnp.int32)
-    before = jnp.where(row > 0, rank[row - 1], 0)
-    index = _WORD * row + _nth_bit(words[row], chosen - before)
-    return jnp.minimum(index, mask.size - 1).astype(jnp.int32), total > 0
-
-
-def _words(mask: jax.Array) -> jax.Array:
-    """Packs (N,) bool into words, lowest bit first, so that sums are over fewer elements."""
-    bits = jnp.pad(mask, (0, -mask.size % _WORD)).reshape(-1, _WORD).astype(jnp.uint32)
-    return jnp.sum(bits << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
-
-
-def _nth_bit(words: jax.Array, n: jax.Array) -> jax.Array:
-    """Finds the position of the n-th set bit of each word (n from 0) by bisection."""
-    position = jnp.zeros_like(n)
-    for half in (16, 8, 4, 2, 1):
-        low = words & jnp.uint32((1 << half) - 1)
-        count = jax.lax.population_count(low).astype(n.dtype)
-        above = n >= count
-        n = jnp.where(above, n - count, n)
-        words = jnp.where(above, words >> half, low)
-        position = position + jnp.where(above, half, 0)
-    return position
+    chosen = (bits % jnp.maximum(ranked.total, 1).astype(jnp.uint32)).astype(jnp.int32)
+    index = true_elements(ranked, chosen)
+    return jnp.minimum(index, mask.size - 1), ranked.total > 0
