@@ -87,10 +87,9 @@ def _by_kernel(
         ]
     )
     sloped = loss.sloped_rows(config, samples)
-    gradient, sums = None, loss.Losses(jnp.float32(0), jnp.float32(0))
+    total = None
     for rows, with_slopes in ((slice(sloped), True), (slice(sloped, None), False)):
-        wanted, weight = targets[0, rows], samples.weight[rows]
-        count = len(weight)
+        count = len(samples.weight[rows])
         if count == 0:
             continue
         padding = (0, -count % hopper_training.TILE)
@@ -104,42 +103,49 @@ def _by_kernel(
             multiprocessors=evaluation.multiprocessors(),
             interpret=evaluation.INTERPRET,
         )
-        part = _multiply(config, padded, padded_targets, factors)
-        gradient = part if gradient is None else jax.tree.map(jnp.add, gradient, part)
-        error = jnp.abs(factors.value[:count] - wanted)
-        slope = loss.slope_of(factors.gradient[:, :count], axis=0) if with_slopes else 1.0
-        sums = loss.Losses(
-            sums.sdf + jnp.sum(error * weight),
-            sums.eikonal + jnp.sum(jnp.abs(slope - 1) * weight),
-        )
-    return gradient, sums
+        weight = jnp.pad(samples.weight[rows], padding)
+        part = _multiply(config, padded, padded_targets, weight, factors)
+        total = part if total is None else jax.tree.map(jnp.add, total, part)
+    return total
 
 
-def _multiply(config: Config, points: jax.Array, targets: jax.Array, factors: Any) -> Any:
-    """Computes the gradient of the weights from its factors; see `hopper_training.Factors`."""
+def _multiply(
+    config: Config, points: jax.Array, targets: jax.Array, weight: jax.Array, factors: Any
+) -> tuple[Any, loss.Losses]:
+    """Computes gradient and sums of `loss_gradient` from `hopper_training.Factors`."""
     wanted, sdf, eikonal = targets
     hidden = jnp.einsum(
         "lpnd,lpne->lde", factors.inputs, factors.angles, preferred_element_type=jnp.float32
     )
     biases = jnp.sum(factors.angles[:, 0], axis=1, dtype=jnp.float32)
     by_angle = factors.first[0].astype(jnp.float32)
-    by_value = jnp.where(factors.value < wanted, -sdf, sdf)
+    error = factors.value - wanted
+    by_value = jnp.where(error < 0, -sdf, sdf)
     # Meters need all of float32: written out, no tensor core rounds them.
-    first = [jnp.sum(points[:, axis, None] * by_angle, axis=0) for axis in range(3)]
-    last = jnp.sum(by_value[:, None] * factors.last[0].astype(jnp.float32), axis=0)
-    if factors.last.shape[0] > 1:  # with slopes
+    by_rows = [points[:, axis, None] * by_angle for axis in range(3)]
+    by_output = by_value[:, None] * factors.last[0].astype(jnp.float32)
+    slope_error = jnp.zeros_like(error)
+    with_slopes = factors.last.shape[0] > 1
+    if with_slopes:
         slope = loss.slope_of(factors.gradient, axis=0)
+        slope_error = jnp.abs(slope - 1)
         by_gradient = jnp.where(slope < 1, -eikonal, eikonal) / slope * factors.gradient
         back = factors.first[1].astype(jnp.float32)
-        first = [
-            total + jnp.sum(by_gradient[axis, :, None] * back, axis=0)
-            for axis, total in enumerate(first)
-        ]
-        last = last + jnp.sum(factors.last[1].astype(jnp.float32), axis=0)
+        by_rows = [row + by_gradient[axis, :, None] * back for axis, row in enumerate(by_rows)]
+        by_output += factors.last[1].astype(jnp.float32)
+    arrays = [*by_rows, by_angle, by_output]
+    # On an H100, 20 and 28 us per epoch; the other way around 32 and 38.
+    if with_slopes:
+        *first, first_bias, last = jnp.sum(jnp.stack(arrays), axis=1)
+    else:
+        *first, first_bias, last = (jnp.sum(array, axis=0) for array in arrays)
+    scalars = jnp.stack([by_value, jnp.abs(error) * weight, slope_error * weight])
+    last_bias, sdf_sum, eikonal_sum = jnp.sum(scalars, axis=1)
     # The kernel's weights, but for the last layer's, are multiplied by omega_0.
     kernels = [config.frequency * kernel for kernel in (jnp.stack(first), *hidden)]
-    by_bias = [config.frequency * bias for bias in (jnp.sum(by_angle, axis=0), *biases)]
+    by_bias = [config.frequency * bias for bias in (first_bias, *biases)]
     kernels.append(last[:, None])
-    by_bias.append(jnp.sum(by_value)[None])
+    by_bias.append(last_bias[None])
     layers = zip(kernels, by_bias, strict=True)
-    return {"params": {f"Dense_{k}": {"kernel": w, "bias": b} for k, (w, b) in enumerate(layers)}}
+    gradient = {f"Dense_{k}": {"kernel": w, "bias": b} for k, (w, b) in enumerate(layers)}
+    return {"params": gradient}, loss.Losses(sdf_sum, eikonal_sum)
