@@ -19,7 +19,6 @@ from hiosdf_jax._src.mapping.stages import (
     refuse,
     run_stages,
 )
-from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.intake import (
     as_traced,
     check_pose,
@@ -32,7 +31,8 @@ from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import MapState, check_map
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
-_TRIED_ROWS = 2000  # tested first; all are, if too few of these lie inside the bounds
+_TRIED_ROWS = 500  # looked at first; all are, if too few of these are in range or inside the bounds
+_CLEAR_SHARE = 2  # times the least share: with so many of them in range, no more are looked at
 
 _NO_FLAG = np.uint32(0)  # inside jit; outside, the number must be on the device already
 
@@ -97,8 +97,8 @@ def update(
     limits = (config.min_range, config.max_range, config.min_in_range)
     if not warn_out_of_range(cloud, *limits):
         warn_outside(cloud, pose, config.bounds, *limits)
-    cloud, pose = jax.device_put((cloud, pose))
-    return run_update(state, cloud, pose, extras, scalar(0, np.uint32), donate)
+    cloud, pose, no_flag = jax.device_put((cloud, pose, _NO_FLAG))
+    return run_update(state, cloud, pose, extras, no_flag, donate)
 
 
 def run_update(
@@ -238,9 +238,18 @@ def warn_out_of_range(
     Returns:
         Whether it warned.
     """
-    square = _square_ranges(cloud)
-    square = square[np.isfinite(square)]
-    usable = np.count_nonzero((square >= min_range**2) & (square <= max_range**2))
+
+    def count(rows: np.ndarray) -> tuple[int, np.ndarray]:
+        """Counts the returns in range, and computes the squared ranges of all."""
+        square = _square_ranges(rows)
+        square = square[np.isfinite(square)]
+        usable = np.count_nonzero((square >= min_range**2) & (square <= max_range**2))
+        return int(usable), square
+
+    usable, square = count(_some_rows(cloud))
+    if usable and usable >= _CLEAR_SHARE * min_share * len(square):
+        return False
+    usable, square = count(cloud)
     if usable >= min_share * len(square):
         return False
     middle = float(np.sqrt(np.median(square)))
@@ -288,7 +297,7 @@ def warn_outside(
                 inside = inside & (world >= bounds[0][k]) & (world <= bounds[1][k])
         return int(np.count_nonzero(in_range)), int(np.count_nonzero(inside))
 
-    some_in_range, some_inside = count(cloud[:: -(-len(cloud) // _TRIED_ROWS)])
+    some_in_range, some_inside = count(_some_rows(cloud))
     if some_inside and some_inside >= min_share * some_in_range:
         return
     in_range, inside = count(cloud)
@@ -302,6 +311,11 @@ def warn_outside(
         "warning off",
         stacklevel=3,
     )
+
+
+def _some_rows(cloud: np.ndarray) -> np.ndarray:
+    """Returns about `_TRIED_ROWS` rows of a cloud, evenly spread."""
+    return cloud[:: -(-len(cloud) // _TRIED_ROWS)]
 
 
 def _square_ranges(cloud: np.ndarray) -> np.ndarray:
