@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.numerics.barriers import differentiate_once
 from hiosdf_jax._src.numerics.vectors import Vector, each, split
 
 type Start = tuple[jax.Array | np.int32, ...]
@@ -139,7 +140,7 @@ def corners_of(config: Config, points_world: jax.Array) -> Corners:
         index = (base.astype(jnp.int32) - first) + upper
         return index, jnp.where(upper == 1, fraction, 1 - fraction)
 
-    points = split(points_world / config.voxel_size - 0.5)
+    points = differentiate_once(split(points_world / config.voxel_size - 0.5))
     parts = [along(*axis) for axis in zip(points, config.corner_index, _UPPER, strict=True)]
     index = (parts[0][0], parts[1][0], parts[2][0])
     nearest = each(lambda i, n: jnp.clip(i, 0, n - 1), index, config.grid_shape)

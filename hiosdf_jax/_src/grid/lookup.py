@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.numerics.barriers import compute_once
+from hiosdf_jax._src.numerics.barriers import compute_once, differentiate_once
 from hiosdf_jax._src.numerics.vectors import (
     Vector,
     cross,
@@ -246,7 +246,7 @@ def _patches_at(
     # Relative to one voxel's center, so that large coordinates lose no digits.
     first = each(lambda i: i[0], corners.index)
     first_world = geometry.voxel_center(config, join(first))
-    point = split((points_world - first_world) / config.voxel_size)
+    point = differentiate_once(split((points_world - first_world) / config.voxel_size))
     sites = each(lambda i, j: jnp.where(found, i + j, 0), corners.index, jump)
     row = geometry.flat_index(config.grid_shape, sites)
     found, sites, row = compute_once((found, sites, row))
