@@ -35,16 +35,23 @@ def test_rays_against_a_loop(hit):
     assert passes.sum() > 100
 
 
-def test_a_long_ray_does_not_depend_on_the_steps_per_iteration(monkeypatch):
+@pytest.mark.parametrize(
+    ("device", "most_chunks"), [("cpu", 16), ("gpu", 100), ("gpu", 1)], ids=str
+)
+def test_a_long_ray_does_not_depend_on_the_steps_per_iteration(monkeypatch, device, most_chunks):
+    """With a range that is as long as the longest ray."""
     ends, sensor = uniform(7, 40, (0.1, 0.1, 0.3), (0.9, 0.9, 0.9)), np.array([0.0, 0.0, 0.25])
-    config = dataclasses.replace(CONFIG, voxel_size=0.02)
     rays = rays_to(ends, sensor)
-    assert np.max(rays.free_ranges) / 0.02 > 60
+    longest_m = float(np.max(rays.free_ranges))
+    config = dataclasses.replace(CONFIG, voxel_size=0.02, max_range=longest_m)
+    assert longest_m / 0.02 > 60
 
     def compiled_anew():
         return jax.jit(functools.partial(carving.trace_rays, config))(empty_window(config), rays)
 
     once = compiled_anew()
+    monkeypatch.setattr(carving, "_MOST_CHUNKS", most_chunks)
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
     for chunk in (5, 100):
         monkeypatch.setattr(carving, "_CHUNK", chunk)
         np.testing.assert_array_equal(compiled_anew().passes, once.passes)

@@ -48,7 +48,7 @@ def test_steps_of_several_shifts_find_the_same(monkeypatch, number):
     """As a GPU takes them, where they do and do not divide all shifts."""
     inside = jnp.asarray(np.random.default_rng(3).random((7, 12, 9)) < 0.9)
     expected = np.asarray(signed_box_distance(inside, 8))
-    monkeypatch.setattr(loops, "_UNROLL", number)
+    monkeypatch.setattr(loops, "_ROUNDS_PER_STEP", number)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     search = jax.jit(lambda inside: frontier.signed_box_distance(inside, 8))
     np.testing.assert_array_equal(np.asarray(search(inside)), expected)

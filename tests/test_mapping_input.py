@@ -142,6 +142,38 @@ def test_returns_outside_the_bounds_are_warned_of(prepared, inside, warns):
     assert all("less than 1 % of its returns in range inside the bounds" in m for m in messages)
 
 
+def spread_out(usable, rows, capacity, first):
+    """A cloud of one usable row at `first`, others spread evenly, and far ones; then padding."""
+    cloud = np.full((capacity, 3), np.nan, np.float32)
+    cloud[:rows] = [9.0, 0, 0]
+    cloud[np.linspace(first, rows - 1, usable).astype(int)] = [2.0, 0, 0]
+    return cloud
+
+
+@pytest.mark.parametrize("first", [0, 7])
+@pytest.mark.parametrize("capacity", [20_000, 50_000, 100_000])
+@pytest.mark.parametrize("share", [0.1, 1.0])
+def test_a_first_look_at_few_rows_does_not_hide_too_few_usable_ones(capacity, share, first):
+    """Whatever the rows that are looked at first: `share` of the rows are returns."""
+    rows = int(share * capacity)
+    bounds = ((-3, -3, -3), (3, 3, 3))
+    for usable, warns in ((1, True), (rows // 500, True), (rows // 40, False)):
+        cloud = spread_out(usable, rows, capacity, first)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert warn_out_of_range(cloud, 0.1, 5.0, 0.01) == warns
+            warn_outside(cloud, np.eye(4, dtype=np.float32), bounds, 0.1, 20.0, 0.01)
+        assert len(caught) == 2 * warns
+
+
+@pytest.mark.parametrize("width", [100, 200, 320, 640])
+def test_one_column_of_an_image_in_range_is_too_few(width):
+    image = np.full((50_000 // width, width, 3), [9.0, 0, 0], np.float32)
+    image[:, 0] = [2.0, 0, 0]
+    with pytest.warns(UserWarning, match="returns between min_range"):
+        assert warn_out_of_range(image.reshape(-1, 3), 0.1, 5.0, 0.02)
+
+
 @pytest.mark.parametrize("rows", [1, 250, 300, 301, 4000])
 def test_a_padded_cloud_is_what_update_maps(rows):
     cloud, pose = np.random.default_rng(rows).normal(size=(rows, 3)), np.eye(4)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.loops import unroll
+from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state import Grid
@@ -65,7 +65,7 @@ def find_piercing(config: Config, grid: Grid, rays: Rays) -> jax.Array:
         jnp.zeros(count, bool),
     )
     start = varying_like(start, sdf, rays)
-    _, met, _ = jax.lax.fori_loop(0, _STEPS, advance, start, unroll=unroll(_STEPS))
+    _, met, _ = jax.lax.fori_loop(0, _STEPS, advance, start, unroll=rounds_per_step(_STEPS))
     x, y, z = jnp.unravel_index(jnp.maximum(met, 0), shape)
     patch = lookup.patch_voxel(config, derived, (x, y, z))
     new = grid.evidence.change.ravel()[patch] > 0

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
-from hiosdf_jax._src.numerics.masks import first_true
+from hiosdf_jax._src.numerics.masks import first_true_indices
 from hiosdf_jax._src.numerics.vectors import each, length, split
 
 # Patches in the box around all spheres that are judged, in the order of their voxels; those beyond
@@ -46,7 +46,7 @@ def clear_robot(
     for k in range(3):
         mapped &= near(center[k], k)
     count = window.hits.size
-    row = first_true(mapped, min(count, _MOST_PATCHES))
+    row = first_true_indices(mapped, min(count, _MOST_PATCHES))
     patch = each(lambda c: c[jnp.minimum(row, count - 1), None], center)
     apart = length(each(jnp.subtract, patch, split(centers_world)))
     ghost = jnp.any(apart < radii, axis=1)

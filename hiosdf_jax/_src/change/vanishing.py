@@ -14,8 +14,8 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.loops import unroll
-from hiosdf_jax._src.numerics.masks import first_true
+from hiosdf_jax._src.numerics.loops import rounds_per_step
+from hiosdf_jax._src.numerics.masks import first_true_indices
 from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
@@ -100,7 +100,7 @@ def drop_vanished(
     slices = 1 + jnp.sum(suspects) // most
     slice_of = jnp.arange(suspects.shape[0], dtype=jnp.int32)[:, None, None]
     suspects &= (slice_of + turn) % slices == 0
-    voxel = first_true(suspects, most)
+    voxel = first_true_indices(suspects, most)
     row = jnp.minimum(voxel, voxels - 1)
 
     old = change.ravel()[row].astype(jnp.int32)
@@ -131,7 +131,7 @@ def drop_vanished(
             remains = (count >= least) & most
             return vanished | (remains & ((crossed > 0) | looked_past))
 
-        return jax.lax.fori_loop(0, _SPREADS, once, vanished, unroll=unroll(_SPREADS))
+        return jax.lax.fori_loop(0, _SPREADS, once, vanished, unroll=rounds_per_step(_SPREADS))
 
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_IF_MET
     vanished = cond(many, spread, lambda vanished: vanished, vanished)

@@ -29,8 +29,8 @@ _BEHIND_STEPS = HIDDEN_VOXELS - 1
 # Steps per loop iteration. Few, large kernels, which hold this many points of every ray in memory.
 _CHUNK = 32
 
-# A GPU makes all that the longest possible ray needs, if they are at most this many. It waits for
-# the host at each iteration of a loop of unknown length.
+# A GPU runs the fixed number of iterations that a ray of max_range needs, if it is at most this: at
+# each iteration of a loop of unknown length it waits for the host.
 _MOST_CHUNKS = 16
 
 
@@ -69,7 +69,7 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
 
     start = (jnp.float32(0), jnp.zeros(voxels, window.passes.dtype))
     start = varying_like(start, rays, window)
-    chunks = math.ceil(config.max_range / size / _CHUNK)
+    chunks = math.floor(config.max_range / size / _CHUNK) + 1  # one more where float32 rounds up
     if jax.default_backend() == "cpu" or chunks > _MOST_CHUNKS:
         _, passes = jax.lax.while_loop(lambda carry: carry[0] < longest, advance, start)
     else:

@@ -10,7 +10,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
-from hiosdf_jax._src.numerics.loops import unroll
+from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import hold, pad_axis
 from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
@@ -53,7 +53,9 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
         return best
 
     start = varying_like(squared, inside)
-    return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, start, unroll=unroll())
+    return jax.lax.fori_loop(
+        np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step()
+    )
 
 
 def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:

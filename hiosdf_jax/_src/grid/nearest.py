@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.loops import unroll
+from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import hold, pad_axis
 
@@ -183,4 +183,6 @@ def _transform_block(
         return best, shift
 
     start = varying_like((best, jnp.zeros(best.shape, jnp.int32)), squared, along)
-    return jax.lax.fori_loop(np.int32(1), np.int32(reach + 1), compare, start, unroll=unroll())
+    return jax.lax.fori_loop(
+        np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step()
+    )

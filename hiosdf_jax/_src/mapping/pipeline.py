@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 import zlib
 from typing import Any
@@ -31,8 +32,9 @@ from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import MapState, check_map
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
-_TRIED_ROWS = 500  # looked at first; all are, if too few of these are in range or inside the bounds
-_CLEAR_SHARE = 2  # times the least share: with so many of them in range, no more are looked at
+_LOOKED_AT = 500  # rows of a cloud; all of them, unless these leave no doubt
+_NO_DOUBT = 2  # times the least share
+_FRACTIONS = np.arange(_LOOKED_AT) * (math.sqrt(1.25) - 0.5) % 1  # of multiples of the golden ratio
 
 _NO_FLAG = np.uint32(0)  # inside jit; outside, the number must be on the device already
 
@@ -247,7 +249,7 @@ def warn_out_of_range(
         return int(usable), square
 
     usable, square = count(_some_rows(cloud))
-    if usable and usable >= _CLEAR_SHARE * min_share * len(square):
+    if _leaves_no_doubt(usable, len(square), min_share):
         return False
     usable, square = count(cloud)
     if usable >= min_share * len(square):
@@ -297,8 +299,8 @@ def warn_outside(
                 inside = inside & (world >= bounds[0][k]) & (world <= bounds[1][k])
         return int(np.count_nonzero(in_range)), int(np.count_nonzero(inside))
 
-    some_in_range, some_inside = count(_some_rows(cloud))
-    if some_inside and some_inside >= min_share * some_in_range:
+    in_range, inside = count(_some_rows(cloud))
+    if _leaves_no_doubt(inside, in_range, min_share):
         return
     in_range, inside = count(cloud)
     if inside >= min_share * in_range:
@@ -314,8 +316,18 @@ def warn_outside(
 
 
 def _some_rows(cloud: np.ndarray) -> np.ndarray:
-    """Returns about `_TRIED_ROWS` rows of a cloud, evenly spread."""
-    return cloud[:: -(-len(cloud) // _TRIED_ROWS)]
+    """Returns `_LOOKED_AT` rows of a larger cloud, spread evenly but not periodically."""
+    if len(cloud) <= _LOOKED_AT:
+        return cloud
+    return cloud[(_FRACTIONS * len(cloud)).astype(np.int64)]
+
+
+def _leaves_no_doubt(usable: int, returns: int, min_share: float) -> bool:
+    """Returns whether so many of some rows are usable that the least share of all rows is too.
+
+    Few returns among the rows, as in a padded cloud, say little.
+    """
+    return usable >= _NO_DOUBT * min_share * max(returns, _LOOKED_AT)
 
 
 def _square_ranges(cloud: np.ndarray) -> np.ndarray:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
+from jax.custom_derivatives import SymbolicZero
 
 
 def compute_once(tree: Any) -> Any:
@@ -26,20 +28,24 @@ def compute_once(tree: Any) -> Any:
 
 @jax.custom_jvp
 def differentiate_once(tree: Any) -> Any:
-    """Has derivatives by arrays computed once, however many others are computed from them.
+    """Returns arrays; derivatives by them are computed once, however many others need them.
 
-    Where three components are joined to vectors, XLA makes one kernel of the join and all that
-    leads to it. For each number of the result it would compute the derivatives by all three.
+    On all devices, XLA makes one kernel of an array and all that leads to it. Where derivatives by
+    three components are joined to vectors, it would compute all three for each number.
 
     Args:
         tree: A pytree of arrays.
 
     Returns:
-        The same arrays. Differentiable.
+        The same arrays. Differentiable any number of times.
     """
     return tree
 
 
-@differentiate_once.defjvp
+@functools.partial(differentiate_once.defjvp, symbolic_zeros=True)
 def _differentiate_once_jvp(primals: Any, tangents: Any) -> Any:
-    return primals[0], jax.lax.optimization_barrier(tangents[0])
+    leaves, structure = jax.tree.flatten(tangents[0])
+    given = [not isinstance(leaf, SymbolicZero) for leaf in leaves]
+    kept = iter(jax.lax.optimization_barrier([t for t, g in zip(leaves, given, strict=True) if g]))
+    held = [next(kept) if g else t for t, g in zip(leaves, given, strict=True)]
+    return primals[0], jax.tree.unflatten(structure, held)

@@ -1,7 +1,7 @@
 """The True elements of a mask by their number: the 0th, the 1st and so on in raveled order.
 
-`jax.numpy.nonzero` with a size adds every element of the mask to one of few sums. On a GPU most of
-them wait for the same one.
+`jax.numpy.nonzero` scatters every element of the mask into `size` counters. On a GPU most of them
+contend for the same one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _WORD = 32  # bits
 
 
 class RankedMask(NamedTuple):
-    """A mask, ready to find its True elements.
+    """A mask in words, with running counts.
 
     Attributes:
         words: The raveled mask, 32 elements per word, lowest bit first, (W,) uint32.
@@ -32,14 +32,14 @@ class RankedMask(NamedTuple):
 
 
 def rank_mask(mask: jax.Array) -> RankedMask:
-    """Packs a mask (...) into words and counts its True elements."""
+    """Packs a mask (...), not empty, into words and counts its True elements."""
     mask = mask.ravel()
     bits = jnp.pad(mask, (0, -mask.size % _WORD)).reshape(-1, _WORD).astype(jnp.uint32)
     words = jnp.sum(bits << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
     return RankedMask(words, jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32)))
 
 
-def true_elements(mask: RankedMask, number: jax.Array) -> jax.Array:
+def indices_of_true(mask: RankedMask, number: jax.Array) -> jax.Array:
     """Finds True elements by their number.
 
     Args:
@@ -58,11 +58,11 @@ def true_elements(mask: RankedMask, number: jax.Array) -> jax.Array:
     return _WORD * row + _nth_bit(words[row], number - before)
 
 
-def first_true(mask: jax.Array, count: int) -> jax.Array:
+def first_true_indices(mask: jax.Array, count: int) -> jax.Array:
     """Finds the first True elements of a mask.
 
     Args:
-        mask: (...) bool.
+        mask: (...) bool, not empty.
         count: Number of elements to find.
 
     Returns:
@@ -70,7 +70,7 @@ def first_true(mask: jax.Array, count: int) -> jax.Array:
         are fewer.
     """
     ranked, number = rank_mask(mask), jnp.arange(count, dtype=jnp.int32)
-    return jnp.where(number < ranked.total, true_elements(ranked, number), mask.size)
+    return jnp.where(number < ranked.total, indices_of_true(ranked, number), mask.size)
 
 
 def _nth_bit(words: jax.Array, n: jax.Array) -> jax.Array:

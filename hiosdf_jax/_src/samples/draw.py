@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.numerics.masks import rank_mask, true_elements
+from hiosdf_jax._src.numerics.masks import indices_of_true, rank_mask
 
 
 class Samples(NamedTuple):
@@ -48,5 +48,5 @@ def draw_from_mask(mask: jax.Array, count: int, key: jax.Array) -> tuple[jax.Arr
     # `randint` has no bias of total / 2^32, and takes three times as long to compile.
     bits = jax.random.bits(key, (count,), jnp.uint32)
     chosen = (bits % jnp.maximum(ranked.total, 1).astype(jnp.uint32)).astype(jnp.int32)
-    index = true_elements(ranked, chosen)
+    index = indices_of_true(ranked, chosen)
     return jnp.minimum(index, mask.size - 1), ranked.total > 0
