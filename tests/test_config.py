@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import inspect
 import math
 import pickle
 
@@ -135,3 +136,14 @@ def test_the_grid_covers_the_bounds_with_whole_voxels(low, high, corner, shape):
     config = hio.Config.light((low, high))
     assert config.corner_index == corner
     assert config.grid_shape == shape
+
+
+def test_an_editor_shows_the_fields_and_their_defaults():
+    parameters = inspect.signature(hio.Config).parameters
+    assert list(parameters) == [field.name for field in dataclasses.fields(hio.Config)]
+    assert parameters["max_range"].default == 20.0
+
+
+def test_a_similar_field_is_named():
+    with pytest.raises(ValueError, match="no field 'voxelsize'; did you mean 'voxel_size'"):
+        hio.Config(BOUNDS, voxelsize=0.1)

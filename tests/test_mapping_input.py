@@ -78,7 +78,8 @@ def test_rows_with_nan_or_inf_are_no_returns():
     [
         (np.full((5, 3), np.nan), "cloud has no finite row among its 5, expected at least one"),
         (np.zeros((0, 3)), "cloud has no finite row among its 0"),
-        (np.zeros((5, 4)), r"cloud has shape \(5, 4\), expected \(N, 3\)"),
+        (np.zeros((5, 4)), r"cloud has shape \(5, 4\), expected \(N, 3\)$"),
+        (np.zeros((3, 4)), r"cloud has shape \(3, 4\), expected \(N, 3\); is it transposed\?"),
         (np.zeros(3), r"cloud has shape \(3,\), expected \(N, 3\)"),
     ],
 )

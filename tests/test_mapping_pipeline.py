@@ -253,6 +253,10 @@ def test_init_and_queries_name_wrong_arguments(room_map):
         hio.update(None, np.ones((1, 3)), np.eye(4))
     with pytest.raises(ValueError, match=r"points has shape \(2,\), expected \(..., 3\)"):
         hio.sdf(room_map, np.zeros(2))
+    with pytest.raises(ValueError, match=r"\(3, 5\), expected \(..., 3\); is it transposed\?"):
+        hio.sdf(room_map, np.zeros((3, 5)))
+    with pytest.raises(ValueError, match="field is ndarray, expected a MapState, a Field or a"):
+        hio.sdf(np.zeros((5, 3)), room_map)
     with pytest.raises(ValueError, match="field is int"):
         hio.query(3, np.zeros(3))
     with pytest.raises(ValueError, match="state is int"):

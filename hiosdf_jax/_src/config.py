@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import inspect
 import math
 import numbers
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
@@ -36,7 +38,8 @@ class Config:
 
     Attributes:
         bounds: Corners ((x0, y0, z0), (x1, y1, z1)) of the mapped box, m, world frame. The grid
-            covers it with whole voxels; a voxel corner lies at the world's origin.
+            covers it with whole voxels; a voxel corner lies at the world's origin. Leave two voxels
+            behind the outer walls: returns beyond the bounds leave no surface.
         voxel_size: Edge of a voxel, m [IV-B].
 
         Clouds:
@@ -150,11 +153,16 @@ class Config:
     weight_average: float = _number(0.9, 0.0, 0.999)
     grid_share: float = _number(0.9, 0.0, 1.0)
 
+    # What editors show: `__new__` takes anything, to name what it refuses.
+    __signature__: ClassVar[inspect.Signature]
+
     def __new__(cls, *_: Any, **fields: Any) -> Self:
         """Refuses unknown fields by a ValueError, as all other wrong arguments."""
         unknown = sorted(set(fields) - set(cls.__dataclass_fields__))
         if unknown:
-            raise ValueError(f"Config has no field {unknown[0]!r}")
+            similar = difflib.get_close_matches(unknown[0], cls.__dataclass_fields__, 1)
+            hint = f"; did you mean {similar[0]!r}?" if similar else ""
+            raise ValueError(f"Config has no field {unknown[0]!r}{hint}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -333,6 +341,12 @@ _LIGHT: dict[str, Any] = {
     "warmup_epochs": 5,
     "weight_average": 0.8,
 }
+
+
+_arguments = inspect.signature(Config.__init__).parameters
+Config.__signature__ = inspect.Signature(
+    [_arguments[name] for name in _arguments if name != "self"]
+)
 
 
 def _checked_bounds(bounds: Any) -> Bounds:

@@ -336,8 +336,10 @@ class Query(NamedTuple):
         observed: Whether a ray has reached the voxel that contains the point, (...) bool.
         frontier: Distance to the nearest voxel that no ray has reached, (...) float32, m; not
             positive in such voxels.
-        lower: At most the true distance at about 99 % of the points of free space, (...) float32,
-            m. It is calibrated on each new cloud, not guaranteed, and counts unseen space as solid.
+        lower: At most the true distance at about 99 % of the points on a sensor's rays, (...)
+            float32, m. It is calibrated on each new cloud, not guaranteed. It is negative in unseen
+            space. In observed space a surface that no ray has met may be nearer: the least of
+            `lower` and `frontier` counts it.
         lower_grad: d(lower)/d(point), (..., 3) float32.
     """
 

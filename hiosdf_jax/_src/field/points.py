@@ -13,6 +13,7 @@ from hiosdf_jax._src.field import blend, lattice
 from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
+from hiosdf_jax._src.numerics.intake import if_transposed
 from hiosdf_jax._src.numerics.modes import pointwise
 from hiosdf_jax._src.numerics.point_tiles import Evaluate, by_rows
 from hiosdf_jax._src.state import (
@@ -99,10 +100,11 @@ def query(field: AnyField, points: Any, unknown: Unknown = "network") -> Query:
         ValueError: An argument has a wrong type, shape or value.
 
     Example:
-        >>> safe = hio.query(field, points).lower > robot_radius
+        >>> answer = hio.query(field, points)
+        >>> safe = jnp.minimum(answer.lower, answer.frontier) > robot_radius
     """
-    points = _checked(points, unknown, "sdf")
-    return _query(as_field(field), points, unknown=unknown)
+    field = as_field(field)
+    return _query(field, _checked(points, unknown, "sdf"), unknown=unknown)
 
 
 def distance(field: AnyField, points: Any, unknown: Unknown, bound: Bound) -> jax.Array:
@@ -121,16 +123,17 @@ def distance(field: AnyField, points: Any, unknown: Unknown, bound: Bound) -> ja
     Raises:
         ValueError: An argument has a wrong type, shape or value.
     """
-    points = _checked(points, unknown, bound)
-    return _distance(as_field(field), points, unknown=unknown, bound=bound)
+    field = as_field(field)
+    return _distance(field, _checked(points, unknown, bound), unknown=unknown, bound=bound)
 
 
 def distance_and_grad(
     field: AnyField, points: Any, unknown: Unknown, bound: Bound
 ) -> tuple[jax.Array, jax.Array]:
     """Computes `distance` and its gradient (..., 3), by one reverse-mode evaluation."""
+    field = as_field(field)
     points = _checked(points, unknown, bound)
-    return _distance_and_grad(as_field(field), points, unknown=unknown, bound=bound)
+    return _distance_and_grad(field, points, unknown=unknown, bound=bound)
 
 
 def as_field(field: AnyField) -> Field | Baked:
@@ -267,7 +270,8 @@ def _checked(points: Any, unknown: Any, bound: Any) -> jax.Array:
         raise ValueError(f"bound is {bound!r}, expected 'sdf' or 'lower'")
     points = on_device("points", points)
     if points.ndim == 0 or points.shape[-1] != 3:
-        raise ValueError(f"points has shape {points.shape}, expected (..., 3)")
+        hint = if_transposed(points)
+        raise ValueError(f"points has shape {points.shape}, expected (..., 3){hint}")
     return points
 
 

@@ -220,6 +220,12 @@ def cloud_and_returns(cloud: Any) -> tuple[np.ndarray, np.ndarray]:
     return floats, finite
 
 
+def if_transposed(vectors: Any) -> str:
+    """Returns a question for the end of a message, if an array of vectors has shape (3, N)."""
+    shape = np.shape(vectors)
+    return "; is it transposed?" if len(shape) == 2 and shape[0] == 3 else ""
+
+
 def check_pose(pose: Any, source: str = "") -> np.ndarray:
     """Checks that a pose is a rigid transform.
 
@@ -304,7 +310,8 @@ def _check_type(name: str, array: Any) -> None:
 
 def _check_cloud_shape(cloud: Any) -> None:
     if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
-        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3)")
+        hint = if_transposed(cloud)
+        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3){hint}")
 
 
 def _check_pose_shape(pose: Any, prefix: str = "") -> None:

@@ -44,7 +44,10 @@ _FINE_END_M = 0.004  # no tolerance below
 
 _FINE_STEPS = 24
 _WHOLE_STEPS = 16  # half steps then: the distance has kinks, around which whole ones may jump
-_FINE_ROWS = 2048
+
+# On held-out frames of a house the median error is 0.29 cm and 0.048 degrees; 0.31 and 0.059 with
+# 2,048 rows, and 0.26 and 0.049 with 4,096.
+_FINE_ROWS = 3072
 _FINISHED_M = 5e-6
 _RESTING_M = 2e-3
 
