@@ -7,7 +7,7 @@ import difflib
 import inspect
 import math
 import numbers
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
@@ -152,9 +152,6 @@ class Config:
     # Queries
     weight_average: float = _number(0.9, 0.0, 0.999)
     grid_share: float = _number(0.9, 0.0, 1.0)
-
-    # What editors show: `__new__` takes anything, to name what it refuses.
-    __signature__: ClassVar[inspect.Signature]
 
     def __new__(cls, *_: Any, **fields: Any) -> Self:
         """Refuses unknown fields by a ValueError, as all other wrong arguments."""
@@ -343,10 +340,8 @@ _LIGHT: dict[str, Any] = {
 }
 
 
-_arguments = inspect.signature(Config.__init__).parameters
-Config.__signature__ = inspect.Signature(
-    [_arguments[name] for name in _arguments if name != "self"]
-)
+# What editors show: `__new__` itself takes anything, to name what it refuses.
+Config.__new__.__dict__["__signature__"] = inspect.signature(Config.__init__)
 
 
 def _checked_bounds(bounds: Any) -> Bounds:
