@@ -13,7 +13,7 @@ from hiosdf_jax._src.field import blend, lattice
 from hiosdf_jax._src.grid.geometry import clip_to_box
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.numerics.intake import if_transposed
+from hiosdf_jax._src.numerics.intake import check_vectors
 from hiosdf_jax._src.numerics.modes import pointwise
 from hiosdf_jax._src.numerics.point_tiles import Evaluate, by_rows
 from hiosdf_jax._src.state import (
@@ -269,9 +269,7 @@ def _checked(points: Any, unknown: Any, bound: Any) -> jax.Array:
     if not (isinstance(bound, str) and bound in ("sdf", "lower")):
         raise ValueError(f"bound is {bound!r}, expected 'sdf' or 'lower'")
     points = on_device("points", points)
-    if points.ndim == 0 or points.shape[-1] != 3:
-        hint = if_transposed(points)
-        raise ValueError(f"points has shape {points.shape}, expected (..., 3){hint}")
+    check_vectors("points", points)
     return points
 
 

@@ -32,9 +32,10 @@ from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import MapState, check_map
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
-_LOOKED_AT = 500  # rows of a cloud; all of them, unless these leave no doubt
-_NO_DOUBT = 2  # times the least share
-_FRACTIONS = np.arange(_LOOKED_AT) * (math.sqrt(1.25) - 0.5) % 1  # of multiples of the golden ratio
+_SAMPLED_ROWS = 500  # of a cloud; all rows are counted where the sample is not clear
+_CLEAR_FACTOR = 2  # a sample is clear from this many times the least share on
+# Fractional parts of multiples of the golden ratio: evenly spread, not periodic.
+_SAMPLED_AT = np.arange(_SAMPLED_ROWS) * (math.sqrt(1.25) - 0.5) % 1
 
 _NO_FLAG = np.uint32(0)  # inside jit; outside, the number must be on the device already
 
@@ -248,8 +249,8 @@ def warn_out_of_range(
         usable = np.count_nonzero((square >= min_range**2) & (square <= max_range**2))
         return int(usable), square
 
-    usable, square = count(_some_rows(cloud))
-    if _leaves_no_doubt(usable, len(square), min_share):
+    usable, square = count(_sample_rows(cloud))
+    if _is_clear(usable, len(square), min_share):
         return False
     usable, square = count(cloud)
     if usable >= min_share * len(square):
@@ -299,8 +300,8 @@ def warn_outside(
                 inside = inside & (world >= bounds[0][k]) & (world <= bounds[1][k])
         return int(np.count_nonzero(in_range)), int(np.count_nonzero(inside))
 
-    in_range, inside = count(_some_rows(cloud))
-    if _leaves_no_doubt(inside, in_range, min_share):
+    in_range, inside = count(_sample_rows(cloud))
+    if _is_clear(inside, in_range, min_share):
         return
     in_range, inside = count(cloud)
     if inside >= min_share * in_range:
@@ -315,19 +316,19 @@ def warn_outside(
     )
 
 
-def _some_rows(cloud: np.ndarray) -> np.ndarray:
-    """Returns `_LOOKED_AT` rows of a larger cloud, spread evenly but not periodically."""
-    if len(cloud) <= _LOOKED_AT:
+def _sample_rows(cloud: np.ndarray) -> np.ndarray:
+    """Returns `_SAMPLED_ROWS` rows of a larger cloud."""
+    if len(cloud) <= _SAMPLED_ROWS:
         return cloud
-    return cloud[(_FRACTIONS * len(cloud)).astype(np.int64)]
+    return cloud[(_SAMPLED_AT * len(cloud)).astype(np.int64)]
 
 
-def _leaves_no_doubt(usable: int, returns: int, min_share: float) -> bool:
-    """Returns whether so many of some rows are usable that the least share of all rows is too.
+def _is_clear(usable: int, returns: int, min_share: float) -> bool:
+    """Returns whether a sample of rows has clearly more than the least share of usable returns.
 
-    Few returns among the rows, as in a padded cloud, say little.
+    A sample of a padded cloud may have few returns. Then the share is that of the sampled rows.
     """
-    return usable >= _NO_DOUBT * min_share * max(returns, _LOOKED_AT)
+    return usable >= _CLEAR_FACTOR * min_share * max(returns, _SAMPLED_ROWS)
 
 
 def _square_ranges(cloud: np.ndarray) -> np.ndarray:

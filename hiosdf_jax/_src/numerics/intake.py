@@ -220,9 +220,23 @@ def cloud_and_returns(cloud: Any) -> tuple[np.ndarray, np.ndarray]:
     return floats, finite
 
 
-def if_transposed(vectors: Any) -> str:
-    """Returns a question for the end of a message, if an array of vectors has shape (3, N)."""
+def check_vectors(name: str, vectors: Any) -> None:
+    """Checks that an array holds vectors, (..., 3); its values may be traced.
+
+    Args:
+        name: What messages call the argument.
+        vectors: An array.
+
+    Raises:
+        ValueError: Its last axis is not of length 3.
+    """
     shape = np.shape(vectors)
+    if not shape or shape[-1] != 3:
+        raise ValueError(f"{name} has shape {shape}, expected (..., 3){_if_transposed(shape)}")
+
+
+def _if_transposed(shape: tuple[int, ...]) -> str:
+    """Returns a question for the end of a message, if an array of vectors has shape (3, N)."""
     return "; is it transposed?" if len(shape) == 2 and shape[0] == 3 else ""
 
 
@@ -309,9 +323,9 @@ def _check_type(name: str, array: Any) -> None:
 
 
 def _check_cloud_shape(cloud: Any) -> None:
-    if np.ndim(cloud) != 2 or np.shape(cloud)[1] != 3:
-        hint = if_transposed(cloud)
-        raise ValueError(f"cloud has shape {np.shape(cloud)}, expected (N, 3){hint}")
+    shape = np.shape(cloud)
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"cloud has shape {shape}, expected (N, 3){_if_transposed(shape)}")
 
 
 def _check_pose_shape(pose: Any, prefix: str = "") -> None:

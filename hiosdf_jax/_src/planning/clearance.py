@@ -10,7 +10,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.points import AnyField, Unknown, distance, distance_and_grad
 from hiosdf_jax._src.numerics.arrays import on_device
-from hiosdf_jax._src.numerics.intake import is_traced
+from hiosdf_jax._src.numerics.intake import check_vectors, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.state import Bound
 
@@ -100,9 +100,8 @@ def checked_spheres(centers: Any, radii: Any, name: str) -> tuple[jax.Array, jax
         ValueError: A type or a shape is wrong, or (outside jit) a radius is negative or not finite.
     """
     centers, radii = on_device(name, centers), on_device("radii", radii)
+    check_vectors(name, centers)
     shape = centers.shape
-    if not shape or shape[-1] != 3:
-        raise ValueError(f"{name} has shape {shape}, expected (..., 3)")
     traced = is_traced(radii)
     if not traced:
         values = np.asarray(jax.device_get(radii))
