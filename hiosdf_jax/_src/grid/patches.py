@@ -16,6 +16,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, rounded
 from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.masks import running_sum
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
 
@@ -69,7 +70,7 @@ def fuse_hits(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWin
     order = jnp.argsort(voxel)
     voxel, offset = voxel[order], offset[order]
     first = jnp.concatenate([jnp.ones(1, bool), voxel[1:] != voxel[:-1]])
-    group = jnp.cumsum(first) - 1
+    group = running_sum(first.astype(jnp.int32)) - 1
     target = jnp.full(count, voxels, voxel.dtype).at[group].set(voxel)
     used = (voxel < voxels).astype(jnp.float32)
 

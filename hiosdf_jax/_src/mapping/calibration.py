@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.samples.draw import draw_from_mask
+from hiosdf_jax._src.numerics.masks import running_sum
+from hiosdf_jax._src.samples.draw import draw_from_mask, draw_words
 from hiosdf_jax._src.state import Field
 
 # Points on surfaces are the hardest: a bound that holds for 94.5 % of the surface holds for 99 % of
@@ -47,7 +48,8 @@ def calibrate_bound(field: Field, rays: Rays, key: jax.Array) -> jax.Array:
         The new optimism, () float32.
     """
     count = min(_RETURNS, rays.ends.size)
-    chosen, possible = draw_from_mask(rays.ends & rays.inside, count, key)
+    (words,) = draw_words(key, (count,))
+    chosen, possible = draw_from_mask(rays.ends & rays.inside, words)
     points_world = jnp.where(possible, rays.points_world[chosen], field.origin_world)
     observed = possible & (blend.frontier(field, points_world) > 0)
     cautious, scale = blend.cautious_sdf(field, points_world)
@@ -63,5 +65,5 @@ def calibrate_bound(field: Field, rays: Rays, key: jax.Array) -> jax.Array:
 def _weighted_quantile(values: jax.Array, weight: jax.Array, quantile: float) -> jax.Array:
     """Finds the least of the values (N,) with at least this share of the weight (N,) up to it."""
     order = jnp.argsort(values)
-    below = jnp.cumsum(weight[order])
+    below = running_sum(weight[order])
     return values[order][jnp.argmax(below >= quantile * below[-1])]

@@ -10,8 +10,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-_WORD = 32  # bits
+from hiosdf_jax._src.numerics.modes import varying_like
+
+WORD = 32  # bits
 
 
 class RankedMask(NamedTuple):
@@ -33,10 +36,38 @@ class RankedMask(NamedTuple):
 
 def rank_mask(mask: jax.Array) -> RankedMask:
     """Packs a mask (...), not empty, into words and counts its True elements."""
+    words = pack_mask(mask)
+    return RankedMask(words, count_bits(words))
+
+
+def pack_mask(mask: jax.Array) -> jax.Array:
+    """Packs a mask (...), not empty, into words, as in `RankedMask`."""
     mask = mask.ravel()
-    bits = jnp.pad(mask, (0, -mask.size % _WORD)).reshape(-1, _WORD).astype(jnp.uint32)
-    words = jnp.sum(bits << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
-    return RankedMask(words, jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32)))
+    bits = jnp.pad(mask, (0, -mask.size % WORD)).reshape(-1, WORD).astype(jnp.uint32)
+    return jnp.sum(bits << jnp.arange(WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
+
+
+def count_bits(words: jax.Array) -> jax.Array:
+    """Counts the bits that are set up to the end of each word, (W,) int32."""
+    return running_sum(jax.lax.population_count(words).astype(jnp.int32))
+
+
+def running_sum(values: jax.Array) -> jax.Array:
+    """Computes the running sum of numbers (N,), as `jax.numpy.cumsum` does.
+
+    On a CPU, XLA makes nine kernels of `cumsum`, and two of this loop. It adds each number log2(N)
+    times, and is as fast up to 100,000 numbers.
+    """
+    if jax.default_backend() != "cpu":
+        return jnp.cumsum(values)
+    index = jnp.arange(values.size, dtype=jnp.int32)
+
+    def add_earlier(step: jax.Array, sums: jax.Array) -> jax.Array:
+        earlier = index - (jnp.int32(1) << step)
+        return sums + jnp.where(earlier >= 0, sums[jnp.maximum(earlier, 0)], 0)
+
+    steps = np.int32((values.size - 1).bit_length())
+    return jax.lax.fori_loop(np.int32(0), steps, add_earlier, values)
 
 
 def indices_of_true(mask: RankedMask, number: jax.Array) -> jax.Array:
@@ -50,12 +81,9 @@ def indices_of_true(mask: RankedMask, number: jax.Array) -> jax.Array:
         Indices into the raveled mask, (N,) int32; undefined for other numbers.
     """
     words, rank = mask
-    # On a GPU the unrolled steps are one kernel; on a CPU each is compiled by itself.
-    method = "scan" if jax.default_backend() == "cpu" else "scan_unrolled"
-    row = jnp.searchsorted(rank, number + 1, method=method)
-    row = jnp.minimum(row, words.size - 1).astype(jnp.int32)
+    row = jnp.minimum(count_below(rank, number + 1), words.size - 1)
     before = jnp.where(row > 0, rank[row - 1], 0)
-    return _WORD * row + _nth_bit(words[row], number - before)
+    return WORD * row + _nth_bit(words[row], number - before)
 
 
 def first_true_indices(mask: jax.Array, count: int) -> jax.Array:
@@ -71,6 +99,22 @@ def first_true_indices(mask: jax.Array, count: int) -> jax.Array:
     """
     ranked, number = rank_mask(mask), jnp.arange(count, dtype=jnp.int32)
     return jnp.where(number < ranked.total, indices_of_true(ranked, number), mask.size)
+
+
+def count_below(ascending: jax.Array, values: jax.Array) -> jax.Array:
+    """Counts the elements (M,) that are less than each value (N,), as `jax.numpy.searchsorted`."""
+    if jax.default_backend() != "cpu":  # the unrolled steps are one kernel
+        return jnp.searchsorted(ascending, values, method="scan_unrolled").astype(jnp.int32)
+    size = ascending.size
+    steps = size.bit_length()
+
+    def advance(step: jax.Array, below: jax.Array) -> jax.Array:
+        more = below + (jnp.int32(1) << (steps - 1 - step))
+        is_less = ascending[jnp.minimum(more, size) - 1] < values
+        return jnp.where((more <= size) & is_less, more, below)
+
+    start = varying_like(jnp.zeros(values.shape, jnp.int32), ascending, values)
+    return jax.lax.fori_loop(np.int32(0), np.int32(steps), advance, start)
 
 
 def _nth_bit(words: jax.Array, n: jax.Array) -> jax.Array:

@@ -1,13 +1,23 @@
-"""Training samples: points with signed distances, and uniform draws from a mask."""
+"""Training samples: points with signed distances, and uniform draws from masks."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from hiosdf_jax._src.numerics.masks import indices_of_true, rank_mask
+from hiosdf_jax._src.numerics.masks import (
+    WORD,
+    RankedMask,
+    count_bits,
+    indices_of_true,
+    pack_mask,
+)
 
 
 class Samples(NamedTuple):
@@ -29,24 +39,77 @@ def concatenate(*parts: Samples) -> Samples:
     return Samples(*(jnp.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def draw_from_mask(mask: jax.Array, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draws True elements of a mask uniformly, with replacement.
-
-    The draw depends only on the order of the True elements. False elements, such as the padding of
-    a cloud, change nothing.
+def draw_words(key: jax.Array, *shapes: tuple[int, ...]) -> list[jax.Array]:
+    """Draws random words by one call of the generator: each call is ten kernels on a CPU.
 
     Args:
-        mask: (...) bool.
-        count: Number of elements to draw.
         key: Source of randomness.
+        shapes: Shapes of the arrays to draw.
 
     Returns:
-        index: Indices into the raveled mask, (count,) int32.
-        possible: Whether any element is True, () bool; the indices are undefined otherwise.
+        Arrays of uint32, one per shape.
     """
-    ranked = rank_mask(mask)
+    sizes = [math.prod(shape) for shape in shapes]
+    words = jax.random.bits(key, (sum(sizes),), jnp.uint32)
+    parts = jnp.split(words, np.cumsum(sizes)[:-1])
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def uniform(words: jax.Array) -> jax.Array:
+    """Turns random words into uniform numbers in [0, 1), float32."""
+    return (words >> 8).astype(jnp.float32) * 2.0**-24
+
+
+def normal(words: jax.Array) -> jax.Array:
+    """Turns random words into normal numbers of variance 1, float32."""
+    # In (-1, 1), without the ends: their normal numbers would be infinite.
+    signed = ((words >> 8).astype(jnp.float32) - (2.0**23 - 0.5)) * 2.0**-23
+    return math.sqrt(2) * jax.lax.erf_inv(signed)
+
+
+def draw_from_masks(
+    masks: Sequence[jax.Array], words: Sequence[jax.Array]
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Draws True elements of masks uniformly, with replacement.
+
+    A draw depends only on the order of the True elements. False elements, such as the padding of a
+    cloud, change nothing. All masks are searched at once, which compiles faster than one by one.
+
+    Args:
+        masks: (...) bool each.
+        words: Random words, (N,) uint32 per mask, one for each draw.
+
+    Returns:
+        indices: Indices into the raveled masks, (N,) int32 each.
+        possible: Whether any element of the mask is True, () bool each; the indices are undefined
+            otherwise.
+    """
+    packed = [pack_mask(mask) for mask in masks]
+    ends = np.cumsum([part.size for part in packed])
+    whole = jnp.concatenate(packed)
+    ranked = RankedMask(whole, count_bits(whole))
+    counts = [jnp.zeros((), jnp.int32), *(ranked.rank[end - 1] for end in ends)]
+    totals = [after - before for before, after in itertools.pairwise(counts)]
     # `randint` has no bias of total / 2^32, and takes three times as long to compile.
-    bits = jax.random.bits(key, (count,), jnp.uint32)
-    chosen = (bits % jnp.maximum(ranked.total, 1).astype(jnp.uint32)).astype(jnp.int32)
-    index = indices_of_true(ranked, chosen)
-    return jnp.minimum(index, mask.size - 1), ranked.total > 0
+    numbers = [
+        (bits % jnp.maximum(total, 1).astype(jnp.uint32)).astype(jnp.int32) + before
+        for bits, total, before in zip(words, totals, counts, strict=False)
+    ]
+    found = indices_of_true(ranked, jnp.concatenate(numbers))
+    indices = [
+        jnp.clip(part - WORD * (end - length.size), 0, mask.size - 1)
+        for part, end, length, mask in zip(
+            jnp.split(found, np.cumsum([bits.size for bits in words])[:-1]),
+            ends.tolist(),
+            packed,
+            masks,
+            strict=True,
+        )
+    ]
+    return indices, [total > 0 for total in totals]
+
+
+def draw_from_mask(mask: jax.Array, words: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Does the same for one mask (...) and random words (N,): indices (N,), possible ()."""
+    (index,), (possible,) = draw_from_masks([mask], [words])
+    return index, possible

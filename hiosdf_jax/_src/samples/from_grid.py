@@ -11,10 +11,9 @@ from hiosdf_jax._src.change.vanishing import is_recent
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.evidence import is_observed
-from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.numerics.vectors import split
-from hiosdf_jax._src.samples.draw import Samples, draw_from_mask
+from hiosdf_jax._src.samples.draw import Samples, draw_from_masks, draw_words, normal, uniform
 from hiosdf_jax._src.state import NO_FEATURE, Grid, surface_of
 
 # Far samples around changes, where the network is most wrong: their number per changed voxel, their
@@ -46,43 +45,45 @@ def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
         derived.nearest[..., 0] != NO_FEATURE
     )
     near = known & (jnp.abs(derived.sdf) < config.near_distance)
-    near_key, far_key, place_key, change_key = jax.random.split(key, 4)
-    near_voxel, any_near = draw_from_mask(near, config.near_samples, near_key)
-    far_voxel, any_far = draw_from_mask(known & ~near, config.far_samples, far_key)
-    voxel = jnp.concatenate([near_voxel, far_voxel])
+    recent = is_recent(evidence.change)
+    around = round(_MOST_CHANGED_SHARE * config.far_samples)
+    count = config.near_samples + config.far_samples
+    shapes = (config.near_samples,), (config.far_samples,), (around,), (count, 3), (around, 3)
+    *words, place_words, spread_words = draw_words(key, *shapes)
+    voxels, (any_near, any_far, _) = draw_from_masks([near, known & ~near, recent], words)
     weight = jnp.concatenate(
         [
             jnp.full(config.near_samples, any_near, jnp.float32),
             jnp.full(config.far_samples, any_far, jnp.float32),
         ]
     )
-    index = jnp.stack(jnp.unravel_index(voxel, config.grid_shape), axis=-1)
-    place = jax.random.uniform(place_key, index.shape, jnp.float32, minval=-0.5, maxval=0.5)
-    points_world = geometry.voxel_center(config, index) + place * config.voxel_size
-    points_world = _move_to_changes(config, evidence.change, known, points_world, change_key)
+    points_world = _voxel_centers(config, jnp.concatenate(voxels[:2]))
+    points_world += (uniform(place_words) - 0.5) * config.voxel_size
+    offset = _CHANGED_SPREAD_M * normal(spread_words)
+    moved = _voxel_centers(config, voxels[2]) + offset
+    wanted = _PER_CHANGED_VOXEL * jnp.sum(recent, dtype=jnp.int32)
+    points_world = _move_to_changes(config, known, points_world, moved, wanted)
     grid_sdf = partial(lookup.grid_sdf, config, surface_of(grid))
     return Samples(points_world, map_tiles(grid_sdf, points_world, _TILE), weight)
 
 
 def _move_to_changes(
-    config: Config, change: jax.Array, known: jax.Array, points_world: jax.Array, key: jax.Array
+    config: Config,
+    known: jax.Array,
+    points_world: jax.Array,
+    moved_world: jax.Array,
+    wanted: jax.Array,
 ) -> jax.Array:
-    """Moves the last points to places around changes, where the map is known there."""
-    recent = is_recent(change)
-    count = round(_MOST_CHANGED_SHARE * config.far_samples)
-    wanted = _PER_CHANGED_VOXEL * jnp.sum(recent, dtype=jnp.int32)
+    """Moves the last points to some places around changes, where the map is known there."""
+    count = moved_world.shape[0]
+    index, _, inside = geometry.voxel_of(config, moved_world)
+    usable = inside & known.ravel()[geometry.flat_index(config.grid_shape, split(index))]
+    usable &= jnp.arange(count) < wanted
+    kept, replaced = jnp.split(points_world, [points_world.shape[0] - count])
+    return jnp.concatenate([kept, jnp.where(usable[:, None], moved_world, replaced)])
 
-    def move(points_world: jax.Array) -> jax.Array:
-        draw_key, place_key = jax.random.split(key)
-        voxel, _ = draw_from_mask(recent, count, draw_key)
-        index = jnp.stack(jnp.unravel_index(voxel, config.grid_shape), axis=-1)
-        offset = _CHANGED_SPREAD_M * jax.random.normal(place_key, index.shape, jnp.float32)
-        around = geometry.voxel_center(config, index) + offset
-        index, _, inside = geometry.voxel_of(config, around)
-        usable = inside & known.ravel()[geometry.flat_index(config.grid_shape, split(index))]
-        usable &= jnp.arange(count) < wanted
-        kept = points_world[points_world.shape[0] - count :]
-        moved = jnp.where(usable[:, None], around, kept)
-        return jnp.concatenate([points_world[: points_world.shape[0] - count], moved])
 
-    return cond(jnp.any(recent), move, lambda points: points, points_world)
+def _voxel_centers(config: Config, voxel: jax.Array) -> jax.Array:
+    """Returns the centers (N, 3) m of voxels (N,), indices into the raveled grid."""
+    index = jnp.stack(jnp.unravel_index(voxel, config.grid_shape), axis=-1)
+    return geometry.voxel_center(config, index)

@@ -13,7 +13,6 @@ from hiosdf_jax._src.field.points import AnyField, as_field
 from hiosdf_jax._src.mapping.registration.equations import (
     GROWING_REACH_M,
     Anchor,
-    compare,
     make_rows,
     take_rows,
     units,
@@ -22,13 +21,12 @@ from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import (
-    FINE_START_M,
     differentiable,
     select_rows,
     solve_coarse,
     solve_fine,
 )
-from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, inflation_of
+from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
 from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.intake import (
     as_floats,
@@ -155,14 +153,8 @@ def _refine(
     near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held, reach_m)
     index, directions = select_rows(still, frozen, near)
     chosen = take_rows(frozen, index)
-    found, finished = solve_fine(still, chosen, near, directions, held, 1.0, FINE_START_M)
-    inflation = jnp.float32(1)
-    if prior is not None:
-        # The prior counts by its covariance, so returns must not count as independent of each
-        # other.
-        inflation = inflation_of(compare(still, chosen, found, 0.0), directions)
-        found, finished = solve_fine(still, chosen, found, directions, held, inflation, 0.0)
-    covariance = covariance_of(compare(still, chosen, found, 0.0), directions, held, rows)
+    found, residuals, rests, inflation = solve_fine(still, chosen, near, directions, held)
+    covariance = covariance_of(residuals, directions, held, rows)
 
     verdict = judge(still, frozen, found)
     finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
@@ -172,7 +164,7 @@ def _refine(
         covariance=covariance,
         residual=verdict.residual,
         inliers=verdict.inliers,
-        converged=finished & verdict.fits & finite,
+        converged=rests & verdict.fits & finite,
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.numerics.masks import count_below, running_sum
+
 # Share of the rows that are drawn evenly. The others are drawn by what they tell of the pose.
 _EVEN_SHARE = 0.2
 
@@ -22,9 +24,9 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     """
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     count = min(count, cloud.shape[0])
-    rank = jnp.cumsum(finite)
+    rank = running_sum(finite.astype(jnp.int32))
     total = rank[-1]
-    row = jnp.searchsorted(rank, even_steps(total, count).astype(rank.dtype) + 1)
+    row = count_below(rank, even_steps(total, count).astype(jnp.int32) + 1)
     some = jnp.arange(count) < total
     row = jnp.where(some, jnp.minimum(row, cloud.shape[0] - 1), 0)
     return jnp.where(some[:, None], cloud[row], 0), some
@@ -62,7 +64,6 @@ def draw_informative(
         return values / jnp.maximum(jnp.sum(values), 1e-30)
 
     chance = _EVEN_SHARE * share(possible) + (1 - _EVEN_SHARE) * share(leverage)
-    below = jnp.cumsum(chance)
+    below = running_sum(chance)
     steps = (jnp.arange(count, dtype=jnp.float32) + 0.5) / count * below[-1]
-    row = jnp.searchsorted(below, steps)
-    return jnp.minimum(row, chance.shape[0] - 1).astype(jnp.int32)
+    return jnp.minimum(count_below(below, steps), chance.shape[0] - 1)
