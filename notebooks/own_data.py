@@ -61,7 +61,8 @@ poses_world_sensor = np.load(folder / "poses.npy")
 def read(index):
     with Image.open(folder / f"{index:03}.png") as image:
         depth = np.asarray(image) / 1000.0  # m; 0 is no return
-    return datasets.depth_to_cloud(depth, intrinsics), poses_world_sensor[index]
+    cloud = np.asarray(datasets.depth_to_cloud(depth, intrinsics))
+    return cloud, poses_world_sensor[index]
 
 
 frames = datasets.FrameStream(folder, len(poses_world_sensor), read)
@@ -122,7 +123,8 @@ print(int(state.updates), "updates; flags:", repr(hio.Flag(int(state.report.flag
 # %%
 returns = np.concatenate(held_out_world).astype(np.float32)
 returns = returns[np.isfinite(returns).all(axis=1)]
-returns = returns[np.asarray(hio.query(field, returns).observed)]
+is_observed = jax.jit(lambda field, points: hio.query(field, points).observed)
+returns = returns[np.asarray(is_observed(field, returns))]
 scores = scoring.held_out_surface(lambda points: hio.sdf(field, points), returns)
 print(f"median distance of held-out returns: {scores['median_cm']:.1f} cm")
 print(f"90 % of them are within {scores['p90_cm']:.1f} cm")

@@ -133,13 +133,12 @@ print(f"error with tracking: {error_cm(corrected):.1f} cm")
 
 # %%
 world_b = np.eye(4)  # T_world_b, which nobody knows
-world_b[:3, :3] = Rotation.from_euler("z", 35, degrees=True).as_matrix()
-world_b[:3, 3] = [3.0, -1.0, 0.0]
+world_b[:3, :3] = Rotation.from_euler("z", 190, degrees=True).as_matrix()
+world_b[:3, 3] = [9.6, 9.0, 0.0]
 frames_b = [stream[i] for i in range(77, 179, 9)]
 poses_b = [(np.linalg.inv(world_b) @ pose).astype(np.float32) for _, pose in frames_b]
 
-config_b = hio.Config.light(((-3, -7, -0.2), (10, 8, 2.8)), max_range=stream.max_range)
-state_b = hio.init(config_b, jax.random.key(1))
+state_b = hio.init(config, jax.random.key(1))
 for (cloud, _), pose in zip(frames_b, poses_b, strict=True):
     state_b = hio.update(state_b, cloud, pose)
 
@@ -151,7 +150,7 @@ for (cloud, _), pose in zip(frames_b, poses_b, strict=True):
 # %%
 cloud, _ = frames_b[0]
 up_sensor = poses_b[0][:3, :3].T @ np.array([0.0, 0.0, 1.0])
-place = hio.relocalize(hio.snapshot(state), cloud, jax.random.key(2), 16_384, up_sensor=up_sensor)
+place = hio.relocalize(hio.snapshot(state), cloud, jax.random.key(2), 4096, up_sensor=up_sensor)
 print(f"score {float(place.score):.2f}, elsewhere {float(place.other_score):.2f}")
 pose_a_b = np.asarray(place.best.pose) @ np.linalg.inv(poses_b[0])
 print(f"the frame of the second robot is {distance_cm(pose_a_b, world_b):.1f} cm off")

@@ -110,11 +110,11 @@ plt.show()
 
 # %%
 above_the_view = jnp.array([2.9, 3.0, 2.1])
-print("observed:", bool(hio.query(field, above_the_view).observed))
-guess = hio.sdf(field, above_the_view)
+guess = hio.query(field, above_the_view)
+print("observed:", bool(guess.observed))
 safe = hio.sdf(field, above_the_view, unknown="obstacle")
 ceiling = demo.signed_distance(stream.model, above_the_view[None])[0][0]
-print(f"network: {float(guess):.2f} m, obstacle: {float(safe):.2f} m, exact: {ceiling:.2f} m")
+print(f"network: {float(guess.sdf):.2f} m, obstacle: {float(safe):.2f} m, exact: {ceiling:.2f} m")
 
 # %% [markdown]
 # ## Gradients point away from obstacles

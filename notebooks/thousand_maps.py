@@ -49,9 +49,9 @@ config = hio.Config.light(
     max_points=RAYS,
     max_range=4.0,
     distance_horizon=1.25,
-    near_samples=100,
-    far_samples=200,
-    local_points=10,
+    near_samples=50,
+    far_samples=50,
+    local_points=4,
     local_ray_samples=5,
     hidden_width=16,
     hidden_layers=1,
@@ -175,14 +175,22 @@ print(f"median error after {SCANS} scans: {median[-1]:.1f} cm")
 # %%
 order = np.argsort(np.asarray(errors_cm[:, -1]))
 chosen = np.concatenate([order[:4], order[-4:]])
-few = jax.tree.map(lambda leaf: leaf[chosen], states)
-few_rooms = jax.tree.map(lambda leaf: leaf[chosen], rooms)
+take = jax.jit(lambda stacks: jax.tree.map(lambda leaf: leaf[chosen], stacks))
+few, few_rooms = take((states, rooms))
 ticks = np.linspace(-1.5, 1.5, 90)
 x, y = np.meshgrid(ticks, ticks)
 plane = jnp.asarray(np.stack([x, y, np.zeros_like(x)], axis=-1), jnp.float32)
-answers = jax.vmap(hio.query, in_axes=(0, None))(few, plane)
-mapped = np.where(answers.observed, answers.sdf, np.nan)
-exact = jax.vmap(exact_sdf, in_axes=(0, None))(few_rooms, plane)
+
+
+@jax.jit
+@jax.vmap
+def slice_of(state, room):
+    """Mapped and exact distances on the plane, m; NaN in unseen space."""
+    answer = hio.query(state, plane)
+    return jnp.where(answer.observed, answer.sdf, jnp.nan), exact_sdf(room, plane)
+
+
+mapped, exact = slice_of(few, few_rooms)
 
 figure, axes = plt.subplots(
     2, 4, figsize=(10, 5.4), dpi=80, sharex=True, sharey=True, layout="constrained"

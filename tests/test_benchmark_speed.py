@@ -248,7 +248,7 @@ def test_a_task_makes_what_it_needs_and_shares_it(monkeypatch, tmp_path):
     assert made == [CONFIG, "rates"]
 
 
-def test_a_row_that_fails_says_why_and_the_rest_goes_on(stream, tmp_path, monkeypatch, capsys):
+def test_a_row_that_fails_says_why_and_the_rest_continues(stream, tmp_path, monkeypatch, capsys):
     def two_tasks(setup):
         sound = rows.Measured([rows.Row("sound", "ms", rows.single(1.5))])
         return {"broken": lambda: [][0], "sound": lambda: sound}

@@ -1,4 +1,4 @@
-"""Runs that are stopped, and runs that go on: the final map is that of a run never stopped."""
+"""Runs that are stopped, and runs that continue: the final map is that of a run never stopped."""
 
 import json
 import shlex
@@ -74,7 +74,7 @@ def check_equal(path, recording):
 
 @pytest.mark.parametrize("number", CODES)
 @pytest.mark.parametrize("frame", [*QUICK, *LONG])
-def test_a_stopped_run_goes_on(tmp_path, capsys, monkeypatch, quick, recording, number, frame):
+def test_a_stopped_run_continues(tmp_path, capsys, monkeypatch, quick, recording, number, frame):
     output, saved = tmp_path / "out", tmp_path / "map.npz"
     arguments = ["map", str(recording[0]), "--output", str(output), "--save", str(saved), *BOX]
     with monkeypatch.context() as patch:
@@ -85,7 +85,7 @@ def test_a_stopped_run_goes_on(tmp_path, capsys, monkeypatch, quick, recording, 
     if frame < FRAMES - 1:
         text = capsys.readouterr().out
         assert f"ended early by {reason}" in text
-        again = text.split(f"stopped by {reason}; to go on:\n")[1].strip()
+        again = text.split(f"stopped by {reason}; to resume:\n")[1].strip()
         assert load_map(saved).progress.next_frame == frame + 1
         assert json.loads((output / "metrics.json").read_text())["stopped_by"] == reason
         assert (output / "mesh.ply").exists()
@@ -177,7 +177,7 @@ def test_a_signal_before_the_mapping(tmp_path, capsys, monkeypatch, quick, recor
     assert (saved.read_bytes(), (output / "metrics.json").read_bytes()) == before
 
 
-def test_a_crashed_run_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch, quick, recording):
+def test_a_crashed_run_continues_from_its_last_checkpoint(tmp_path, monkeypatch, quick, recording):
     output = tmp_path / "out"
     output.mkdir()
     (output / "metrics.json").write_text("of an older run")
@@ -229,7 +229,7 @@ def test_a_map_of_another_run_is_kept_aside(tmp_path, monkeypatch, quick, record
     assert frames_of(output / "checkpoint.npz") == 4
 
 
-def test_a_run_goes_on_behind_a_bad_frame(tmp_path, monkeypatch, quick, capsys):
+def test_a_run_continues_after_a_bad_frame(tmp_path, monkeypatch, quick, capsys):
     stream = write_points(tmp_path / "scans.npz", 8, bad=[5])
     arguments = ["map", str(stream), "--output", str(tmp_path / "out"), *BOX]
     whole, part = tmp_path / "whole.npz", tmp_path / "part.npz"

@@ -118,7 +118,7 @@ def run(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         # A few frames of a stream show that the code runs.
-        patch.setattr(demo, "ApartmentStream", lambda frames: whole(min(frames, 5)))
+        patch.setattr(demo, "ApartmentStream", lambda frames: whole(min(frames, 3)))
         patch.setattr(hio, "update", shared(hio.update))
         yield run_block
 

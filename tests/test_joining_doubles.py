@@ -3,7 +3,6 @@
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,7 +11,9 @@ from voxels import CONFIG, SHAPE, empty_window
 from hiosdf_jax._src.grid import distance, patches
 from hiosdf_jax._src.mapping.joining import adding, doubles
 
-drop_doubles = jax.jit(doubles.drop_doubles, static_argnums=0)
+is_surface = jax.jit(doubles.is_surface, static_argnums=0)
+is_feature = jax.jit(patches.is_feature, static_argnums=0)
+drop = jax.jit(doubles.drop_doubles, static_argnums=0)
 NAMES = ("hits", "passes", "behind", "weight", "change", "mean", "axes")
 
 
@@ -20,13 +21,19 @@ def window_of(cells, mean, axes, hits=5.0, weight=None, passes=1.0):
     """Evidence with some patches; all other voxels are free."""
     at = tuple(np.transpose(cells))
     numbers = {"hits": hits, "weight": hits if weight is None else weight, "passes": passes}
-    window = empty_window()._replace(passes=jnp.full(SHAPE, 9.0))
+    numbers |= {"mean": mean, "axes": axes}
+    window = empty_window()._replace(passes=np.full(SHAPE, 9, np.float32))
     for name, value in numbers.items():
-        window = window._replace(**{name: getattr(window, name).at[at].set(value)})
-    return window._replace(
-        mean=window.mean.astype(jnp.float32).at[at].set(mean),
-        axes=window.axes.astype(jnp.float32).at[at].set(axes),
-    )
+        array = np.array(getattr(window, name), np.float32)
+        array[at] = value
+        window = window._replace(**{name: array})
+    return window
+
+
+def changed(array, at, value):
+    result = np.array(array)
+    result[at] = value
+    return result
 
 
 def random_window(seed, share):
@@ -47,7 +54,23 @@ def random_window(seed, share):
 
 
 def surfaces(window):
-    return np.asarray(doubles.is_surface(CONFIG, window))
+    return np.asarray(is_surface(CONFIG, window))
+
+
+@jax.jit
+def sum_of(windows, passes, coincides):
+    """The sum of a map and of others that were moved, whose rays passed each voxel so often."""
+    moves = [adding.Moved(coincides, lambda offset, each=each: each) for each in passes]
+    return adding.sum_evidence(CONFIG, windows, [None, *moves])
+
+
+def total_of(windows, coincides=False):
+    passes = [np.abs(window.passes) for window in windows[1:]]
+    return sum_of(list(windows), passes, np.array(coincides))
+
+
+def drop_doubles(config, *pair):
+    return jax.tree.map(np.asarray, drop(config, *pair))
 
 
 def slow_lies_on(window, other, counts):
@@ -55,9 +78,10 @@ def slow_lies_on(window, other, counts):
     found = np.zeros(SHAPE, bool)
     mean, axes = (np.asarray(x, float) for x in (window.mean, window.axes))
     other_mean, other_axes = (np.asarray(x, float) for x in (other.mean, other.axes))
+    weight, other_weight = np.asarray(window.weight), np.asarray(other.weight)
     for cell in np.argwhere(np.asarray(window.hits) > 0):
         for near in np.argwhere(counts):
-            if np.abs(near - cell).max() > 1 or other.weight[*near] <= window.weight[*cell]:
+            if np.abs(near - cell).max() > 1 or other_weight[*near] <= weight[*cell]:
                 continue
             apart = cell + mean[*cell] - near - other_mean[*near]
             for axis in other_axes[*near][:2]:
@@ -70,15 +94,17 @@ def slow_lies_on(window, other, counts):
 
 def test_dropped_patches_are_those_of_loops_and_lie_on_a_patch_that_stays():
     pair = random_window(0, 0.3), random_window(1, 0.3)
-    sure = [(w.hits >= 10) & (w.hits >= 0.5 * (w.hits + jnp.abs(w.passes))) for w in pair]
+    numbers = [[np.asarray(x) for x in (w.hits, w.passes)] for w in pair]
+    sure = [(hits >= 10) & (hits >= 0.5 * (hits + np.abs(passes))) for hits, passes in numbers]
     surface = [surfaces(window) for window in pair]
     after = drop_doubles(CONFIG, *pair)
     lost = [
-        np.asarray((old.hits > 0) & (new.hits == 0)) for old, new in zip(pair, after, strict=True)
+        (np.asarray(old.hits) > 0) & (np.asarray(new.hits) == 0)
+        for old, new in zip(pair, after, strict=True)
     ]
     for own, (k, j) in enumerate([(0, 1), (1, 0)]):
-        on_sure = slow_lies_on(pair[k], pair[j], surface[j] & np.asarray(sure[j]))
-        expected = on_sure & ~surface[j] & ~np.asarray(sure[k])
+        on_sure = slow_lies_on(pair[k], pair[j], surface[j] & sure[j])
+        expected = on_sure & ~surface[j] & ~sure[k]
         np.testing.assert_array_equal(lost[own], expected)
         assert expected.sum() > 5
         assert not (lost[own] & ~slow_lies_on(pair[k], pair[j], surface[j] & ~lost[j])).any()
@@ -126,12 +152,11 @@ def test_a_dropped_patch_leaves_no_free_voxel_where_no_ray_passed():
 def test_what_a_patch_was_dropped_for_stays_in_the_sum():
     """Its own map may have looked through the place of the surer patch many times."""
     thin = window_of([(5, 5, 3)], (0, 0, 0.3), flat(), hits=8.0, passes=2.0)
-    thin = thin._replace(passes=thin.passes.at[5, 5, 4].set(60.0))
+    thin = thin._replace(passes=changed(thin.passes, (5, 5, 4), 60))
     for hits in (8.5, 12.0, 40.0):  # too few hits to be sure, and more
         wall = window_of([(5, 5, 4)], (0, 0, -0.5), flat(), hits=hits, passes=hits)
         for pair in ((thin, wall), (wall, thin)):
-            total = adding.sum_evidence(CONFIG, pair, [None, moved(pair[1], False)])
-            assert surfaces(total)[5, 5, 3:5].any()
+            assert surfaces(total_of(pair))[5, 5, 3:5].any()
 
 
 def test_a_chain_of_patches_keeps_one_within_reach_of_each():
@@ -139,12 +164,12 @@ def test_a_chain_of_patches_keeps_one_within_reach_of_each():
     p = window_of([(5, 5, 2)], (0, 0, 0.45), flat(), hits=4.0)
     q = window_of([(5, 5, 3)], (0, 0, 0.1), flat(), hits=8.0)
     r = window_of([(5, 5, 4)], (0, 0, -0.3), flat(), hits=40.0)
-    few = [w._replace(passes=jnp.minimum(w.passes, 1)) for w in (p, q, r)]
+    few = [w._replace(passes=np.minimum(w.passes, 1)) for w in (p, q, r)]
     for order in itertools.permutations(few):
-        moves = [None, *(moved(window, False) for window in order[1:])]
-        total = adding.sum_evidence(CONFIG, order, moves)
+        total = total_of(order)
         there = np.argwhere(surfaces(total))
-        heights = [cell[2] + float(total.mean[*cell][2]) for cell in there]
+        mean = np.asarray(total.mean)
+        heights = [cell[2] + mean[*cell][2] for cell in there]
         for height in (2.45, 3.1, 3.7):
             assert min(abs(height - h) for h in heights) < 0.75
 
@@ -156,17 +181,13 @@ def test_a_surface_of_both_maps_in_one_voxel_is_no_double():
         np.testing.assert_array_equal(after.hits, window.hits)
 
 
-def moved(window, coincides):
-    return adding.Moved(jnp.asarray(coincides), lambda offset: jnp.abs(window.passes))
-
-
 def test_maps_whose_voxels_coincide_keep_all_their_hits():
-    pair = [random_window(seed, 0.1)._replace(passes=jnp.ones(SHAPE)) for seed in (2, 3)]
-    hits = sum(float(window.hits.sum()) for window in pair)
+    ones = np.ones(SHAPE, np.float32)
+    pair = [random_window(seed, 0.1)._replace(passes=ones) for seed in (2, 3)]
+    hits = sum(float(np.sum(window.hits)) for window in pair)
 
     def total(coincides):
-        moves = [None, moved(pair[1], coincides)]
-        return float(adding.sum_evidence(CONFIG, pair, moves).hits.sum())
+        return float(np.sum(total_of(pair, coincides).hits))
 
     assert total(True) == pytest.approx(hits, rel=1e-5)
     assert total(False) < 0.995 * hits
@@ -175,12 +196,13 @@ def test_maps_whose_voxels_coincide_keep_all_their_hits():
 def test_rays_of_a_moved_map_carve_stray_hits_where_its_voxels_overlap_unseen_ones():
     stray = window_of([(5, 5, 3)], (0, 0, 0.2), np.diag([0.1, 0.05, 0.01]), hits=2.0)
     wall = window_of([(5, 5, 5)], (0, 0, -0.4), flat(), hits=50.0)
-    wall = wall._replace(passes=wall.passes.at[5, 5, 3].set(0))  # rebinning took them
+    wall = wall._replace(passes=changed(wall.passes, (5, 5, 3), 0))  # rebinning took them
 
     def is_there(passed):
-        through = adding.Moved(jnp.asarray(False), lambda offset: jnp.full(SHAPE, passed))
-        total = adding.sum_evidence(CONFIG, [stray, wall], [None, through])
-        return bool(patches.is_feature(CONFIG, total.hits, total.passes, total.axes)[5, 5, 3])
+        through = np.full(SHAPE, passed, np.float32)
+        total = sum_of([stray, wall], [through], np.array(False))
+        known = np.asarray(total.hits), np.asarray(total.passes), np.asarray(total.axes)
+        return bool(is_feature(CONFIG, *known)[5, 5, 3])
 
     assert is_there(3.0)
     assert not is_there(100.0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import BOUNDS, CONFIG, arrays_equal, map_of_room, room_sdf, stream
+from room import BOUNDS, CONFIG, arrays_equal, ask, distances, map_of_room, room_sdf, stream
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
@@ -29,7 +29,7 @@ def moved_points(pose, points):
 
 def error_cm(state, points=POINTS, exact=None):
     exact = room_sdf(points) if exact is None else exact
-    return 100 * np.abs(np.asarray(hio.sdf(state, points)) - exact).mean()
+    return 100 * np.abs(distances(state, points) - exact).mean()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_the_identity_keeps_the_map(room_map):
     assert arrays_equal(same.network, room_map.network)
     for part in ("report", "key", "updates", "optimism"):
         assert arrays_equal(getattr(same, part), getattr(room_map, part)), part
-    assert arrays_equal(hio.query(same, POINTS), hio.query(room_map, POINTS))
+    assert arrays_equal(ask(same, POINTS), ask(room_map, POINTS))
 
 
 @pytest.mark.parametrize("rotvec", [(0, 0, 0), (0, 0, np.pi)])
@@ -72,8 +72,8 @@ def test_whole_voxels_and_half_turns_answer_as_before(room_map, rotvec):
     pose = pose_of(rotvec, (0.1, -0.1, 0.0))
     moved = hio.transform(room_map, pose)
     inner = (np.abs(POINTS) < 0.4).all(axis=1)  # what left the box is far from here
-    there = hio.query(moved, moved_points(pose, POINTS))
-    here = hio.query(room_map, POINTS)
+    there = ask(moved, moved_points(pose, POINTS))
+    here = ask(room_map, POINTS)
     np.testing.assert_allclose(there.sdf[inner], here.sdf[inner], atol=2e-3)
     assert np.mean(np.abs(there.sdf - here.sdf)[inner]) < 2e-4
 
@@ -83,9 +83,7 @@ def test_an_oblique_move_loses_little_and_says_so_by_frontier(sharp_map):
     moved = hio.transform(sharp_map, pose)
     there = moved_points(pose, POINTS)
     assert error_cm(moved, there, room_sdf(POINTS)) < 1.5 * error_cm(sharp_map) + 0.2
-    seen, before = (
-        np.asarray(hio.query(*pair).observed) for pair in ((moved, there), (sharp_map, POINTS))
-    )
+    seen, before = (ask(*pair).observed for pair in ((moved, there), (sharp_map, POINTS)))
     assert (seen & ~before).mean() < 0.02
     assert seen.mean() > 0.6 * before.mean()
 
@@ -100,7 +98,7 @@ def test_two_halves_are_as_good_as_one_pass(halves, merged):
     assert hio.Flag(int(merged.report.flags)) == 0
 
 
-def test_a_merged_map_goes_on(merged, tmp_path):
+def test_a_merged_map_can_be_updated(merged, tmp_path):
     hio.save(tmp_path / "map.npz", merged)
     loaded = hio.load(tmp_path / "map.npz")
     assert arrays_equal(loaded, merged)
@@ -113,7 +111,7 @@ def test_an_empty_map_adds_nothing(room_map, empty_map):
         total = hio.merge(*pair, EYE)
         assert int(total.updates) == 4
         assert arrays_equal(total.network, room_map.network)
-        assert arrays_equal(hio.query(total, POINTS), hio.query(room_map, POINTS))
+        assert arrays_equal(ask(total, POINTS), ask(room_map, POINTS))
 
 
 def test_a_thing_that_one_map_has_met_is_solid_in_both_orders(halves):
@@ -152,7 +150,7 @@ def test_correct_puts_submaps_where_they_belong(halves, merged):
 
 
 def test_inside_jit_a_bad_pose_is_flagged_and_adds_nothing(room_map, empty_map):
-    bad = jnp.full((4, 4), jnp.nan)
+    bad = np.full((4, 4), np.nan, np.float32)  # not weakly typed: no compilation of its own
     for call in (hio.transform, lambda state, pose: hio.merge(state, state, pose)):
         assert jax.eval_shape(call, room_map, bad).config == CONFIG
     # What these run inside the user's jit, compiled once for all tests.

@@ -16,6 +16,10 @@ from hiosdf_jax._src.numerics.shifts import with_neighbors
 
 TARGET = dataclasses.replace(CONFIG, bounds=((-1.3, -1.4, -1.1), (1.5, 1.6, 2.0)))
 rebin = jax.jit(rebinning.rebin, static_argnums=(0, 2))
+passes_at = jax.jit(rebinning.passes_at, static_argnums=(0, 2))
+coincides = jax.jit(rebinning.coincides, static_argnums=0)
+is_feature = jax.jit(patches.is_feature, static_argnums=0)
+is_doubtful = jax.jit(patches.is_doubtful)
 
 
 def rigid(rotation, shift):
@@ -54,7 +58,7 @@ def moved(stored, pose, target=TARGET):
 
 def features(config, known):
     hits, passes = (np.asarray(x, np.float32) for x in (known.hits, known.passes))
-    return np.asarray(patches.is_feature(config, hits, passes, known.axes))
+    return np.asarray(is_feature(config, hits, passes, known.axes))
 
 
 @pytest.mark.parametrize("turn", [None, [0, 0, np.pi / 2], [np.pi / 2, 0, 0], [0, np.pi, 0]])
@@ -90,7 +94,7 @@ def slow_patches(known, pose):
     """Patches by voxel of the new grid, in float64: (level, hits, passes, weight, mean, axes)."""
     hits, passes = (np.asarray(x, float) for x in (known.hits, known.passes))
     sure = features(CONFIG, known)
-    maybe = np.asarray(patches.is_doubtful(jnp.asarray(hits), jnp.asarray(passes)))
+    maybe = np.asarray(is_doubtful(hits.astype(np.float32), passes.astype(np.float32)))
     found = {}
     for cell in np.argwhere(hits > 0):
         at = tuple(cell)
@@ -148,7 +152,7 @@ def test_stray_hits_that_meet_are_no_surface(stored):
     single = stored.replace(hits=hits, passes=jnp.zeros_like(stored.passes))
     window = rebin(strict, single, target, jnp.asarray(POSE, jnp.float32))
     assert float(window.hits.max()) == 1
-    assert not np.asarray(patches.is_feature(target, window.hits, window.passes, window.axes)).any()
+    assert not np.asarray(is_feature(target, window.hits, window.passes, window.axes)).any()
 
 
 def test_a_voxel_is_seen_only_where_all_voxels_that_it_overlaps_are(stored):
@@ -184,7 +188,7 @@ def test_passes_are_looked_up_in_the_voxel_that_holds_the_point(stored):
     offset = uniform(5, int(np.prod(TARGET.grid_shape)), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     offset = np.asarray(offset).reshape(*TARGET.grid_shape, 3)
     pose = jnp.asarray(POSE, jnp.float32)
-    found = np.asarray(rebinning.passes_at(CONFIG, stored, TARGET, pose, jnp.asarray(offset)))
+    found = np.asarray(passes_at(CONFIG, stored, TARGET, pose, offset))
     back, passes = np.linalg.inv(POSE), np.abs(np.asarray(stored.passes, float))
     points = np.argwhere(np.ones(TARGET.grid_shape)) + TARGET.corner_index + 0.5
     points = (points + offset.reshape(-1, 3)) @ back[:3, :3].T + 10 * back[:3, 3]
@@ -207,4 +211,4 @@ def test_passes_are_looked_up_in_the_voxel_that_holds_the_point(stored):
 )
 def test_only_whole_voxels_and_quarter_turns_coincide(turn, shift, expected):
     pose = rigid(Rotation.from_rotvec(turn).as_matrix(), shift)
-    assert bool(rebinning.coincides(TARGET, jnp.asarray(pose, jnp.float32))) == expected
+    assert bool(coincides(TARGET, jnp.asarray(pose, jnp.float32))) == expected

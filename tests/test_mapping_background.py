@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from room import arrays_equal, stream
+from room import CONFIG, arrays_equal, stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.background import fusing
@@ -130,11 +130,33 @@ def test_the_robot_and_the_noise_are_passed_on(empty_map):
     cloud, pose = stream(1)[0]
     # As many spheres as in test_mapping_robot_and_noise.py: one compilation.
     robot = (cloud[:2] @ pose[:3, :3].T + pose[:3, 3], np.full(2, 0.1))
-    for extras in ({"robot": robot}, {"noise": (0.004, 0.001)}):
-        with hio.BackgroundMapper(empty_map) as mapper:
-            mapper.put(cloud, pose, **extras)
-        assert arrays_equal(mapper.wait(), hio.update(empty_map, cloud, pose, **extras))
-    assert int(hio.update(empty_map, cloud, pose, robot=robot).report.points_used) < len(cloud)
+    noise = (0.004, 0.001)
+    with hio.BackgroundMapper(empty_map) as mapper:
+        mapper.put(cloud, pose, robot=robot, noise=noise)
+    state = mapper.wait()
+    assert arrays_equal(state, hio.update(empty_map, cloud, pose, robot=robot, noise=noise))
+    # Both change the map.
+    assert int(state.report.points_used) < len(cloud)
+    other = hio.update(empty_map, cloud, pose, robot=robot, noise=CONFIG.range_noise)
+    assert not arrays_equal(state.grid.evidence, other.grid.evidence)
+
+
+@pytest.mark.parametrize("given", [{"robot": (np.ones((2, 3)), [0.1, 0.2])}, {"noise": (0.1, 0.2)}])
+def test_the_robot_or_the_noise_alone_is_passed_on(empty_map, monkeypatch, given):
+    passed = []
+
+    def record(state, *_, **extras):
+        passed.append({name: extra for name, extra in extras.items() if extra is not None})
+        return state
+
+    monkeypatch.setattr(fusing, "update", record)
+    with hio.BackgroundMapper(empty_map) as mapper:
+        mapper.put(*stream(1)[0], **given)
+    (extras,) = passed
+    assert extras.keys() == given.keys()
+    for name, expected in given.items():
+        for part, values in zip(extras[name], expected, strict=True):
+            np.testing.assert_allclose(part, values, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from room import BOUNDS, CONFIG, arrays_equal, stream
+from room import BOUNDS, CONFIG, arrays_equal, ask, stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid.evidence import empty_grid
@@ -40,7 +40,7 @@ def test_evidence_is_gone_inside_and_equal_outside(room_map, forgotten):
 
 def test_points_inside_are_unseen_and_solid_on_request(forgotten):
     points = np.random.default_rng(0).uniform((0.65, -0.45, -0.45), (0.95, 0.45, 0.45), (500, 3))
-    answer = hio.query(forgotten, points.astype(np.float32), unknown="obstacle")
+    answer = ask(forgotten, points, "obstacle")
     assert not np.asarray(answer.observed).any()
     assert (np.asarray(answer.sdf) < 0).all() and (np.asarray(answer.lower) < 0).all()
 
@@ -76,7 +76,7 @@ def test_the_same_clouds_fill_the_box_again(room_map, forgotten):
     for cloud, pose in stream(4):
         state = hio.update(state, cloud, pose)
     points = np.random.default_rng(1).uniform((0.65, -0.3, -0.3), (0.9, 0.3, 0.3), (300, 3))
-    before, after = (hio.query(each, points.astype(np.float32)) for each in (room_map, state))
+    before, after = (ask(each, points) for each in (room_map, state))
     seen = np.asarray(before.observed)
     assert seen.mean() > 0.3
     assert np.asarray(after.observed)[seen].mean() > 0.98

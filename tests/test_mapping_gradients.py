@@ -135,6 +135,16 @@ def test_forward_mode_and_scans_are_traced(empty_map):
     assert values.shape == tangents.shape == (len(POINTS),)
 
 
+@jax.jit
+def push_forward(spread, change):
+    return jax.jvp(patches.principal_axes, (spread,), (change,))
+
+
+@jax.jit
+def slope_of_axes(spread):
+    return jax.grad(lambda s: sum(jnp.sum(x) for x in patches.principal_axes(s)))(spread)
+
+
 def test_principal_axes_turn_and_grow_as_in_float64():
     rng = np.random.default_rng(3)
     factor = rng.normal(size=(40, 3, 3))
@@ -149,8 +159,8 @@ def test_principal_axes_turn_and_grow_as_in_float64():
     h = 1e-6
     (near, axes), (far, other) = exact(spread - h * change), exact(spread + h * change)
     other *= np.sign(np.sum(axes * other, axis=-1, keepdims=True))
-    arguments = [(jnp.asarray(array, jnp.float32),) for array in (spread, change)]
-    (deviation, direction), (grown, turned) = jax.jvp(patches.principal_axes, *arguments)
+    arguments = (array.astype(np.float32) for array in (spread, change))
+    (deviation, direction), (grown, turned) = push_forward(*arguments)
     sign = np.sign(np.sum(axes * np.asarray(direction), axis=-1, keepdims=True))
     np.testing.assert_allclose(grown, (far - near) / (2 * h), rtol=2e-3, atol=2e-3)
     expected = sign * (other - axes) / (2 * h)
@@ -160,10 +170,10 @@ def test_principal_axes_turn_and_grow_as_in_float64():
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
 def test_principal_axes_of_a_flat_patch_have_finite_derivatives(rank):
-    factor = np.random.default_rng(4).normal(size=(20, 3, rank))
-    spread = jnp.asarray(factor @ factor.transpose(0, 2, 1), jnp.float32)
+    factor = np.random.default_rng(4).normal(size=(40, 3, rank))
+    spread = (factor @ factor.transpose(0, 2, 1)).astype(np.float32)
     for derivative in (
-        jax.jvp(patches.principal_axes, (spread,), (jnp.ones_like(spread),))[1],
-        jax.grad(lambda s: sum(jnp.sum(x) for x in patches.principal_axes(s)))(spread),
+        push_forward(spread, np.ones_like(spread))[1],
+        slope_of_axes(spread),
     ):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative))

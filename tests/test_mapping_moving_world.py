@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import CONFIG, HALF, arrays_equal, room_cloud
+from room import CONFIG, HALF, arrays_equal, ask, room_cloud
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.change import novelty
@@ -34,12 +34,6 @@ def view(seed, with_box):
     return (rays * reach[:, None]).astype(np.float32), pose
 
 
-def ask(state, points, unknown="obstacle"):
-    """An answer for up to 2,000 points, by one compilation."""
-    answer = hio.query(state, np.resize(points, (2000, 3)).astype(np.float32), unknown)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(points)], answer)
-
-
 def inside_box(margin):
     axes = [np.linspace(a + margin, b - margin, 6) for a, b in zip(LOW, HIGH, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -58,13 +52,13 @@ def history(sharp_map):
 
 def test_a_box_that_appears_is_solid_and_free_again_when_it_is_gone(history):
     points = inside_box(0.06)
-    before = ask(history["before"][-1], points)
+    before = ask(history["before"][-1], points, "obstacle")
     assert (before.sdf > 0.1).all() and before.observed.all() and (before.lower > 0).all()
-    during = ask(history["with"][-1], points)
+    during = ask(history["with"][-1], points, "obstacle")
     assert (during.sdf < 0).all()
     assert (during.lower < 0).all()
     assert during.observed.mean() < 0.5
-    after = ask(history["after"][-1], points)
+    after = ask(history["after"][-1], points, "obstacle")
     assert (after.sdf > 0.1).all() and after.observed.all() and (after.lower > 0).all()
     assert np.abs(after.sdf - before.sdf).mean() < 0.05
 
@@ -77,7 +71,7 @@ def test_the_front_of_a_new_box_is_a_surface_at_once(history):
     last = ask(history["with"][-1], front, "network").sdf
     assert np.mean(np.abs(first) < 0.05) > 0.6
     assert np.abs(last).max() < 0.05
-    just_behind = ask(history["with"][0], np.add(front, [0.07, 0, 0]))
+    just_behind = ask(history["with"][0], np.add(front, [0.07, 0, 0]), "obstacle")
     assert np.mean(just_behind.sdf < 0) > 0.9
 
 
@@ -91,11 +85,11 @@ def test_a_wall_behind_a_box_is_remembered(history):
     ]
     assert (hits[0] > 2).all() and (hits[1] > 2).all()
     before, during = (history[when][-1] for when in ("before", "with"))
-    assert ask(before, wall).observed.all()
-    assert ask(during, wall).observed.mean() < 0.3
+    assert ask(before, wall, "obstacle").observed.all()
+    assert ask(during, wall, "obstacle").observed.mean() < 0.3
     for state in (before, *history["after"]):  # from the first scan that sees it again
         assert np.abs(ask(state, wall, "network").sdf).max() < 0.04
-    assert ask(history["after"][-1], wall).observed.all()
+    assert ask(history["after"][-1], wall, "obstacle").observed.all()
 
 
 def test_returns_on_what_is_new_are_counted(history):
@@ -176,24 +170,22 @@ def test_other_faults_are_not_counted_as_contradictions(sharp_map):
     assert int(far.report.refused_in_row) == 1
 
 
+@jax.jit
+def check(state, cloud, pose):
+    finite = jnp.ones(len(cloud), bool)
+    return stages.run_stages(stages.begin(state, cloud, finite, pose), stages.CHECKS)
+
+
 @pytest.mark.parametrize(
     ("most", "refused", "accepted"), [(10, 9, False), (10, 10, True), (3, 3, True), (0, 0, True)]
 )
 def test_the_configuration_says_how_many_clouds_are_refused(sharp_map, most, refused, accepted):
-    state = sharp_map.replace(
-        config=dataclasses.replace(CONFIG, most_refusals=most),
-        report=sharp_map.report.replace(refused_in_row=jnp.int32(refused)),
-    )
-
-    @jax.jit
-    def check(state, cloud, pose):
-        finite = jnp.ones(len(cloud), bool)
-        step = stages.run_stages(stages.begin(state, cloud, finite, pose), stages.CHECKS)
-        return stages.is_accepted(step), step.flags
-
-    found, flags = check(state, *contradiction())
-    assert bool(found) == accepted
-    assert int(flags) == hio.Flag.INCONSISTENT_CLOUD
+    report = sharp_map.report.replace(refused_in_row=np.int32(refused))
+    step = check(sharp_map.replace(report=report), *contradiction())
+    config = dataclasses.replace(CONFIG, most_refusals=most)  # after the checks: one compilation
+    step = step._replace(state=step.state.replace(config=config))
+    assert bool(stages.is_accepted(step)) == accepted
+    assert int(step.flags) == hio.Flag.INCONSISTENT_CLOUD
 
 
 def test_random_points_are_always_refused(sharp_map):

@@ -1,5 +1,7 @@
 """The kernel for Hopper GPUs, interpreted on a CPU, against numpy in float64, and its choice."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +14,13 @@ from hiosdf_jax._src.network import evaluation, siren
 pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
 
 
+# Compiled as wholes: one operation after another compiles each for itself.
+init_params = jax.jit(siren.init_params, static_argnums=0)
+
+
 def network(width, layers):
     config = hio.Config.default(BOUNDS, hidden_width=width, hidden_layers=layers)
-    return config, siren.init_params(config, jax.random.key(width + layers))
+    return config, init_params(config, jax.random.key(width + layers))
 
 
 def points_of(rows):
@@ -58,7 +64,8 @@ def test_several_networks_at_once_are_left_to_xla(interpreted):
     second = jax.tree.map(lambda leaf: 1.1 * leaf, first)
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), first, second)
     points = points_of(4)
-    value, gradient = jax.vmap(siren.predict_with_gradient, (None, 0, None))(config, both, points)
+    predict = jax.vmap(functools.partial(siren.predict_with_gradient, config), (0, None))
+    value, gradient = jax.jit(predict)(both, points)
     for index, params in enumerate([first, second]):
         assert relative(value[index], numpy_forward(config, params, points)) < 1e-4
         assert relative(gradient[index], numpy_gradient(config, params, points)) < 1e-3

@@ -65,7 +65,7 @@ def test_one_step_is_adamw_on_equation_3():
 
 
 def test_training_fits_and_the_average_has_no_bias():
-    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples(256)
+    network, samples = training.init_network(TINY, jax.random.key(0)), some_samples()
     first = train(TINY, network, samples, 1)[1]
     trained, last, _ = train(TINY, network, samples, 400)
     assert float(last.sdf) < 0.2 * float(first.sdf)
@@ -136,9 +136,12 @@ def test_each_slope_counts_once_in_every_few_epochs(monkeypatch, every, tile):
         np.testing.assert_allclose(a, b, atol=2e-4)
 
 
+# With slopes of all samples no epoch depends on its number: one case is enough.
 @pytest.mark.parametrize("device", ["cpu", "gpu"])
-@pytest.mark.parametrize("every", [1, 3])
-@pytest.mark.parametrize(("epochs", "warmup_epochs"), [(5, 5), (2, 5), (5, 2), (2, 1), (1, 50)])
+@pytest.mark.parametrize(
+    ("every", "epochs", "warmup_epochs"),
+    [(3, 5, 5), (3, 2, 5), (3, 5, 2), (3, 2, 1), (3, 1, 50), (1, 2, 5)],
+)
 def test_extra_epochs_are_like_all_others(monkeypatch, device, every, epochs, warmup_epochs):
     tiny = dataclasses.replace(TINY, eikonal_every=every)
     network, samples = training.init_network(tiny, jax.random.key(0)), some_samples(72)
@@ -159,7 +162,8 @@ def test_extra_epochs_are_like_all_others(monkeypatch, device, every, epochs, wa
 def test_a_step_in_tiles_equals_a_step(monkeypatch, every):
     config = dataclasses.replace(TINY, eikonal_every=every)
     network, samples = training.init_network(config, jax.random.key(0)), some_samples(70)
-    whole, *_ = train(config, network, samples, 1)
+    if every == 1:
+        whole, *_ = train(config, network, samples, 1)
     monkeypatch.setattr(tiles, "LARGEST", 16)
     batch = jax.tree.map(
         lambda array: array[0], training._split(config, samples, jax.random.key(0))

@@ -8,6 +8,10 @@ from hypothesis import strategies as st
 
 from hiosdf_jax._src.numerics import masks
 
+# Compiled as wholes: one operation after another compiles each for itself.
+rank_mask, indices_of_true = jax.jit(masks.rank_mask), jax.jit(masks.indices_of_true)
+first_true_indices = jax.jit(masks.first_true_indices, static_argnums=1)
+
 
 @settings(deadline=None)
 @given(
@@ -18,15 +22,15 @@ from hiosdf_jax._src.numerics import masks
 def test_true_elements_are_those_of_numpy(size: int, share: float, seed: int) -> None:
     mask = np.random.default_rng(seed).random(size) < share
     expected = np.flatnonzero(mask)
-    ranked = masks.rank_mask(mask)
+    ranked = rank_mask(mask)
     assert int(ranked.total) == len(expected)
     some = np.arange(min(len(expected), 5), dtype=np.int32)
     if some.size:
-        found = masks.indices_of_true(ranked, some)
-        np.testing.assert_array_equal(found, expected[some])
+        found = indices_of_true(ranked, np.resize(some, 5))
+        np.testing.assert_array_equal(found, expected[np.resize(some, 5)])
     count = 40  # more than some of the masks have
     padded = np.append(expected, np.full(count, size))[:count]
-    np.testing.assert_array_equal(masks.first_true_indices(mask, count), padded)
+    np.testing.assert_array_equal(first_true_indices(mask, count), padded)
 
 
 @pytest.mark.parametrize("shape", [(3, 5, 70), (1,), (4, 8)])
@@ -38,3 +42,16 @@ def test_first_true_ravels_and_batches(shape: tuple[int, ...]) -> None:
         expected = np.flatnonzero(one)
         np.testing.assert_array_equal(row[: len(expected)], expected)
         assert (np.asarray(row[len(expected) :]) == count).all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 31, 1000])
+@pytest.mark.parametrize("dtype", [np.int32, np.float32])
+def test_running_sums_and_bisection_are_those_of_numpy(size: int, dtype: type) -> None:
+    values = np.random.default_rng(size).integers(0, 3, size).astype(dtype)
+    sums = masks.running_sum(values)
+    assert sums.dtype == dtype
+    np.testing.assert_array_equal(sums, np.cumsum(values))
+    wanted = np.arange(-1, int(values.sum()) + 2).astype(dtype)
+    np.testing.assert_array_equal(
+        masks.count_below(sums, wanted), np.searchsorted(np.cumsum(values), wanted)
+    )

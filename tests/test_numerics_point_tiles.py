@@ -64,15 +64,18 @@ def test_derivatives(tiled):
 
     given = FIELD["center"], POINTS
     for argument in (0, 1, (0, 1)):
-        found, expected = (jax.grad(total(f), argument)(*given) for f in (tiled, distance))
+        found, expected = (jax.jit(jax.grad(total(f), argument))(*given) for f in (tiled, distance))
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), found, expected)
     point = POINTS[0]
     for transform in (jax.grad, jax.jacfwd, jax.hessian):
         found, expected = (transform(lambda p, f=f: f(FIELD, p)) for f in (tiled, distance))
-        close(found(point), expected(point))
-        close(jax.vmap(found)(POINTS), jax.vmap(expected)(POINTS))
-    found = jax.jvp(lambda p: tiled(FIELD, p), (POINTS,), (jnp.ones_like(POINTS),))
-    close(found, jax.jvp(lambda p: distance(FIELD, p), (POINTS,), (jnp.ones_like(POINTS),)))
+        close(jax.jit(found)(point), jax.jit(expected)(point))
+        close(jax.jit(jax.vmap(found))(POINTS), jax.jit(jax.vmap(expected))(POINTS))
+
+    def along(function):
+        return jax.jit(lambda p: jax.jvp(lambda p: function(FIELD, p), (p,), (jnp.ones_like(p),)))
+
+    close(along(tiled)(POINTS), along(distance)(POINTS))
 
 
 def test_whole_numbers_of_a_field_have_no_derivative(tiled):

@@ -10,7 +10,7 @@ import hiosdf_jax as hio
 from hiosdf_jax import planning
 from hiosdf_jax._src.field import points as queries
 
-COUNT = 200
+COUNT = 2000  # as many as in other tests: one compilation
 RADII = np.full(COUNT, 0.05, np.float32)
 STEP = 1e-3
 

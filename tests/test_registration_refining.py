@@ -14,6 +14,8 @@ import hiosdf_jax as hio
 RESOLUTION = 0.05
 NOISE = (0.01, 0.0)
 COUNT = 700
+MANY = 200
+NO_WEIGHT = np.zeros((4, 4), np.float32)
 
 
 def baked_field(distance, half):
@@ -40,8 +42,8 @@ def room():
 
 @pytest.fixture(scope="module")
 def corridor():
-    """Two parallel walls, without floor, ceiling or end."""
-    return baked_field(lambda points: 1 - np.abs(points[..., 1]), (3, 1.5, 1.5))
+    """Two parallel walls, without floor, ceiling or end, in as many samples: one compilation."""
+    return baked_field(lambda points: 1 - np.abs(points[..., 1]), HALF + 0.6)
 
 
 def moved(pose, translation, turn):
@@ -69,13 +71,45 @@ def noisy(cloud, rng, sigma=NOISE[0]):
 
 
 @jax.jit
-def refine(field, cloud, pose):
-    return hio.refine_pose(field, cloud, pose, noise=NOISE)
+def refine_and_slope(field, cloud, pose, weight):
+    """Also the gradient of the pose's weighted entries by the cloud, in the same compilation."""
+
+    def score(cloud):
+        found = hio.refine_pose(field, cloud, pose, noise=NOISE)
+        return jnp.sum(weight * found.pose), found
+
+    slope, found = jax.grad(score, has_aux=True)(cloud)
+    return found, slope
 
 
 @jax.jit
+def refine_and_slope_with_prior(field, cloud, pose, mean, covariance, weight):
+    """The same with a prior; the gradient is that by its mean."""
+
+    def score(mean):
+        found = hio.refine_pose(field, cloud, pose, (mean, covariance), noise=NOISE)
+        return jnp.sum(weight * found.pose), found
+
+    slope, found = jax.grad(score, has_aux=True)(mean)
+    return found, slope
+
+
+@jax.jit
+def refine_all(field, clouds, poses):
+    """Refines `MANY` poses: a loop over batches."""
+
+    def refine_one(frame):
+        return hio.refine_pose(field, *frame, noise=NOISE)
+
+    return jax.lax.map(refine_one, (clouds, poses), batch_size=MANY // 4)
+
+
+def refine(field, cloud, pose):
+    return refine_and_slope(field, cloud, pose, NO_WEIGHT)[0]
+
+
 def refine_with_prior(field, cloud, pose, mean, covariance):
-    return hio.refine_pose(field, cloud, pose, (mean, covariance), noise=NOISE)
+    return refine_and_slope_with_prior(field, cloud, pose, mean, covariance, NO_WEIGHT)[0]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -118,12 +152,13 @@ def test_noise_and_outliers_against_scipy(room):
 def test_the_covariance_is_that_of_the_errors(room):
     rng = np.random.default_rng(1)
     clouds, poses = zip(
-        *(room_cloud(i, COUNT, 0.1 * i, rng.uniform(-0.2, 0.2, 3)) for i in range(200)), strict=True
+        *(room_cloud(i, COUNT, 0.1 * i, rng.uniform(-0.2, 0.2, 3)) for i in range(MANY)),
+        strict=True,
     )
     starts = np.stack([perturbed(pose, rng, 0.05, 3) for pose in poses])
     clouds = np.stack([noisy(cloud, rng) for cloud in clouds])
-    found = jax.jit(jax.vmap(refine, (None, 0, 0)))(room, clouds, starts)
-    away = np.stack([error(a, b) for a, b in zip(found.pose, poses, strict=True)])
+    found = refine_all(room, clouds, starts)
+    away = np.stack([error(a, b) for a, b in zip(np.asarray(found.pose), poses, strict=True)])
     square = np.einsum("ni,nij,nj->n", away, np.linalg.inv(np.asarray(found.covariance)), away)
     high = chi2.ppf(0.975, 6)
     # Never too sure. The floor of the noise, which the map's own errors need, is cautious here.
@@ -135,12 +170,11 @@ def test_one_cloud_batches_and_jit_agree(room):
     cloud, pose = room_cloud(5, COUNT)
     starts = np.stack([perturbed(pose, np.random.default_rng(i), 0.05, 3) for i in range(3)])
     one = [refine(room, cloud, start) for start in starts]
-    batch = jax.vmap(refine, (None, None, 0))(room, cloud, starts)
-    _, scanned = jax.lax.scan(lambda _, start: (None, refine(room, cloud, start)), None, starts)
+    which = np.arange(MANY) % 3
+    batches = refine_all(room, np.broadcast_to(cloud, (MANY, COUNT, 3)), starts[which])
     eager = hio.refine_pose(room, cloud, starts[0], noise=NOISE)
-    for i, single in enumerate(one):
-        np.testing.assert_allclose(batch.pose[i], single.pose, atol=1e-4)
-        np.testing.assert_allclose(scanned.pose[i], single.pose, atol=1e-4)
+    expected = np.stack([single.pose for single in one])[which]
+    np.testing.assert_allclose(batches.pose, expected, atol=1e-4)
     np.testing.assert_allclose(eager.pose, one[0].pose, atol=1e-4)
 
 
@@ -228,9 +262,9 @@ def test_derivatives_by_the_cloud_are_finite_differences(room):
     weight = rng.normal(size=(4, 4)).astype(np.float32)
 
     def score(cloud):
-        return jnp.sum(weight * refine(room, cloud, start).pose)
+        return np.sum(weight * refine(room, cloud, start).pose)
 
-    slope = np.nan_to_num(jax.grad(score)(cloud))
+    slope = np.nan_to_num(refine_and_slope(room, cloud, start, weight)[1])
     for way in ways:
         step = 2e-3
         change = (score(cloud + step * way) - score(cloud - step * way)) / (2 * step)
@@ -243,14 +277,18 @@ def test_derivatives_by_the_prior_are_finite_differences(corridor):
     cloud = corridor_cloud(rng)
     prior = np.diag([0.1, 0.02, 0.1, 0.05, 0.05, 0.05]).astype(np.float32) ** 2
 
-    def place(shift):
-        mean = jnp.eye(4).at[:3, 3].set(shift)
-        return refine_with_prior(corridor, cloud, jnp.eye(4), mean, prior).pose[:3, 3]
+    eye = np.eye(4, dtype=np.float32)
 
-    shift = jnp.asarray([0.03, 0.01, -0.02])
-    slope = jax.jacrev(place)(shift)
+    def place(shift, weight=NO_WEIGHT):
+        """The place, and its weighted gradient by the shift."""
+        mean = moved(eye, shift, np.zeros(3))
+        found, slope = refine_and_slope_with_prior(corridor, cloud, eye, mean, prior, weight)
+        return np.asarray(found.pose)[:3, 3], np.asarray(slope)[:3, 3]
+
+    shift = np.array([0.03, 0.01, -0.02])
+    slope = [place(shift, np.outer(axis, eye[3]))[1] for axis in eye[:3]]
     step = 5e-3
-    change = [(place(shift + d) - place(shift - d)) / (2 * step) for d in step * np.eye(3)]
+    change = [(place(shift + d)[0] - place(shift - d)[0]) / (2 * step) for d in step * np.eye(3)]
     np.testing.assert_allclose(slope, np.stack(change, axis=1), atol=0.01)
     np.testing.assert_allclose(np.diag(slope)[[0, 2]], 1, atol=0.01)
 
@@ -315,10 +353,10 @@ def test_wrong_input_is_named(room, change, message):
         hio.refine_pose(**arguments)
 
 
-@pytest.mark.parametrize("x64", [False, True])
-def test_types_do_not_depend_on_the_modes_of_jax(sharp_map, x64):
+def test_types_do_not_depend_on_the_modes_of_jax(sharp_map):
+    """Strict promotion of 64-bit numbers: each other mode converts more of what is mixed."""
     cloud, pose = room_cloud(3, COUNT)
-    with jax.enable_x64(x64), jax.numpy_dtype_promotion("standard" if x64 else "strict"):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"):
         found = jax.eval_shape(lambda: hio.refine_pose(sharp_map, jnp.asarray(cloud), pose))
         _, tracked = jax.eval_shape(lambda state: hio.track(state, cloud, pose), sharp_map)
     for answer in (found, tracked):

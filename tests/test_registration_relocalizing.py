@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from poses import random_pose
-from room import HALF, room_cloud
+from room import BOUNDS, HALF, room_cloud
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.field.lattice import sample_counts
 from hiosdf_jax._src.mapping.registration.relocalizing import (
     _ROUNDS,
     _Cells,
@@ -41,11 +42,12 @@ def furnished_distance(points):
 
 
 def baked(distance):
-    half = HALF + 0.6
-    shape = tuple(np.ceil(2 * half / RESOLUTION).astype(int) + 1)
-    values = distance(-half + RESOLUTION * np.moveaxis(np.indices(shape), 0, -1))
+    """Samples as `bake` makes of a map of the room: `refine_pose` is compiled once for both."""
+    corner = np.array(BOUNDS[0])
+    shape = sample_counts(np.array(BOUNDS[1]) - corner, RESOLUTION)
+    values = distance(corner + RESOLUTION * np.moveaxis(np.indices(shape), 0, -1))
     return hio.Baked(
-        corner_world=jnp.asarray(-half, jnp.float32),
+        corner_world=jnp.asarray(corner, jnp.float32),
         resolution=jnp.float32(RESOLUTION),
         sdf=jnp.asarray(values, jnp.float32),
         frontier=jnp.where(values > -0.1, 1.0, -1.0).astype(jnp.float32),
@@ -156,7 +158,7 @@ def test_the_costs_of_returns_are_those_of_their_cells(seed):
 def test_one_copy_of_each_hypothesis_stays():
     """So a round never makes a hypothesis worse."""
     tried = _Upright(jnp.arange(12.0).reshape(4, 3), jnp.arange(4.0))
-    copies = _copy(tried, _ROUNDS[0], jax.random.key(0))
+    copies = jax.jit(_copy, static_argnums=1)(tried, _ROUNDS[0], jax.random.key(0))
     for part, moved in zip(tried, copies, strict=True):
         np.testing.assert_array_equal(moved[:, 0], part)
         assert len(np.unique(moved[0].reshape(-1, *np.shape(part[0])), axis=0)) == moved.shape[1]

@@ -73,8 +73,9 @@ from room import arrays_equal, stream
 import hiosdf_jax as hio
 from hiosdf_jax import planning
 
-POINTS = np.random.default_rng(0).uniform(-0.8, 0.8, (8, 3)).astype(np.float32)
-RADII = np.full(8, 0.05, np.float32)
+COUNT = 2000  # as many as in other tests: one compilation
+POINTS = np.random.default_rng(0).uniform(-0.8, 0.8, (COUNT, 3)).astype(np.float32)
+RADII = np.full(COUNT, 0.05, np.float32)
 ROWS = PartitionSpec("rows")
 KINDS = ["map", "baked"]
 
@@ -95,8 +96,9 @@ def obstacle(field, points):
 def everything(field, points):
     """Traces every query and clearance."""
     centers = jnp.stack([points, points])
-    data = planning.BodyPoses(points, jnp.broadcast_to(jnp.eye(3, dtype=jnp.float32), (8, 3, 3)))
-    spheres = planning.RobotSpheres(jnp.arange(8, dtype=jnp.int32), points, RADII)
+    turns = jnp.broadcast_to(jnp.eye(3, dtype=jnp.float32), (COUNT, 3, 3))
+    data = planning.BodyPoses(points, turns)
+    spheres = planning.RobotSpheres(jnp.arange(COUNT, dtype=jnp.int32), points, RADII)
     return (
         hio.query(field, points, unknown="obstacle"),
         planning.swept_clearance_and_grad(field, points, points, RADII, bound="lower"),
@@ -139,14 +141,10 @@ def test_gradients_with_explicit_axes(fields):
 def test_shard_map_with_its_checks(fields, kind):
     mesh = jax.make_mesh((1,), ("rows",), axis_types=(AxisType.Auto,))
     specs = {"in_specs": (PartitionSpec(), ROWS), "out_specs": ROWS}
-    sharded = jax.jit(jax.shard_map(swept_of_points, mesh=mesh, **specs))
+    sharded = jax.jit(jax.shard_map(swept, mesh=mesh, **specs))
     np.testing.assert_allclose(
-        sharded(fields[kind], POINTS), swept_of_points(fields[kind], POINTS), atol=1e-5
+        sharded(fields[kind], POINTS), swept(fields[kind], POINTS), atol=1e-5
     )
-
-
-def swept_of_points(field, points):
-    return planning.swept_clearance(field, points, points + jnp.float32(0.1), 0.05)
 
 
 def test_shard_map_of_an_update_and_of_a_trajectory(empty_map, fields):
@@ -264,7 +262,7 @@ def test_gradients_by_the_float_leaves_of_a_map(fields, kind):
     @jax.jit
     @jax.value_and_grad
     def loss(floats, rest):
-        return jnp.sum(hio.sdf(rest.combine(floats), POINTS) ** 2)
+        return jnp.sum(hio.sdf(rest.combine(floats), POINTS[:8]) ** 2)
 
     value, gradient = loss(floats, field)
     assert jax.tree.structure(gradient) == jax.tree.structure(floats)

@@ -24,8 +24,8 @@ _JUDGED = 1024  # rays, about
 
 # A cloud contradicts the map if more than this share of the rays that can be compared is wrong, and
 # this share of all rays: they end in free space or go through walls. On house_depth and house_lidar
-# at most 6 % are wrong, and 34 % in the apartment seen in 24 frames. Of rays 1.3 times as long it
-# is 76 % or more.
+# at most 6 % are wrong, and 34 % in the apartment seen in 24 frames. With rays 1.3 times as
+# long it is 76 % or more.
 _MOST_WRONG = 0.5
 _LEAST_WRONG = 0.25
 

@@ -183,8 +183,8 @@ def smoothness(rays: Rays, chosen: jax.Array) -> jax.Array:
         chosen: Its rows of interest, (N,) bool.
 
     Returns:
-        Of the pixels with chosen rays, and with several ranges in the 3 x 3 pixels around: the
-        share where these are within 20 %, () float32; `UNKNOWN` if there are few such pixels.
+        Share of the pixels with chosen rays and several ranges in the 3 x 3 pixels around where
+        these ranges are within 20 %, () float32; `UNKNOWN` if there are few such pixels.
     """
     if rays.in_range.size < _LEAST_PIXELS:
         return jnp.float32(UNKNOWN)

@@ -178,7 +178,7 @@ def _look(
 
     axes = window.axes.reshape(-1, 9)
     long, middle, short = (take(axes, row, first) for first in (0, 3, 6))
-    # A flat patch is a rectangle. Of others, the rectangle faces the sensor.
+    # A flat patch is a rectangle. The rectangle of any other patch faces the sensor.
     flat = length(short) < 0.5 * length(middle)
     unit_long = unit(long)
     away = unit(offset)

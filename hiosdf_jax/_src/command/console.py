@@ -12,7 +12,7 @@ from hiosdf_jax._src.command.failures import BAD_INPUT, Failure
 
 
 class LastingText:
-    """A text stream that notes a failure to write and goes on without writing.
+    """A text stream that notes a failure to write and continues without writing.
 
     Attributes:
         failure: The first failure, or None.

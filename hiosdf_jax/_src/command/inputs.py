@@ -1,4 +1,4 @@
-"""What the command reads: a stream, exact distances, a configuration, a map to go on with."""
+"""What the command reads: a stream, exact distances, a configuration, a map to resume."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def configure(name: str | None, bounds: Any, **overrides: float) -> Config:
 
 
 def resumed_map(options: argparse.Namespace) -> SavedMap | None:
-    """The map to go on with; raises a failure if it contradicts the other options."""
+    """The map to resume; raises a failure if it contradicts the other options."""
     if options.resume is None:
         return None
     from hiosdf_jax._src.command.progress import load_map

@@ -104,7 +104,7 @@ class LiveMap:
     def watch(
         self, state: MapState, progress: Progress, cloud: np.ndarray, pose: np.ndarray
     ) -> None:
-        """Is given each frame, as `fuse_frames` has fused it; returns when the mapping may go on.
+        """Receives each fused frame of `fuse_frames`; returns when the mapping may continue.
 
         Args:
             state: The map.

@@ -36,7 +36,7 @@ class StoppedError(Exception):
 
 
 class OtherStreamError(ValueError):
-    """A map that is to go on was made from other frames."""
+    """The map to resume was made from other frames."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +88,7 @@ def fuse_frames(
     Args:
         stream: The frames.
         config: The map's configuration.
-        key: Source of the map's randomness; a map to go on with has its own.
+        key: Source of the map's randomness; a resumed map has its own.
         held_out: Indices of frames that the map is not given; the result has returns of theirs.
         skip_bad_frames: Report bad frames on stderr and continue. By default the first bad frame
             ends the mapping.
@@ -107,7 +107,7 @@ def fuse_frames(
     Raises:
         BadFrameError: A frame is bad and nothing was mapped before it.
         NothingMappedError: No frame could be mapped.
-        OtherStreamError: The map to go on with was made from other frames.
+        OtherStreamError: The map to resume was made from other frames.
         StoppedError: The mapping was to end before anything was mapped.
     """
     from tqdm import tqdm

@@ -96,7 +96,7 @@ def run_stream(
         BadFrameError: A frame is bad.
         StoppedError: `stop` has ended the mapping.
         NothingMappedError: No frame could be mapped.
-        OtherStreamError: The map to go on with was made from other frames.
+        OtherStreamError: The map to resume was made from other frames.
         OSError: The folder or a file in it cannot be written.
     """
     output = Path(output)

@@ -1,4 +1,4 @@
-"""How far a map has come in its stream, kept in its file so that a run can go on."""
+"""How far a map has come in its stream, kept in its file so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Progress(NamedTuple):
 
 
 class SavedMap(NamedTuple):
-    """A map that a run can go on with.
+    """A map that a run can resume.
 
     Attributes:
         state: The map.
@@ -45,7 +45,7 @@ class SavedMap(NamedTuple):
 
 
 class FrameDigest:
-    """Digest of the frames of a stream: it tells one stream from another."""
+    """Digest of the frames of a stream, which identifies the stream."""
 
     def __init__(self) -> None:
         """Begins before the first frame."""
@@ -64,7 +64,7 @@ class FrameDigest:
 
 
 def save_map(path: str | os.PathLike[str], saved: SavedMap) -> None:
-    """Writes a map that a run can go on with; `hiosdf_jax.load` reads it like any other.
+    """Writes a map that a run can resume; `hiosdf_jax.load` reads it like any other.
 
     Args:
         path: The file.

@@ -30,7 +30,7 @@ def run_mapping(
     resumed: SavedMap | None,
     **settings: Any,
 ) -> None:
-    """Maps, scores and draws; turns what ends the mapping into a failure or a hint to go on."""
+    """Maps, scores and draws; turns what ends the mapping into a failure or a hint to resume."""
     from hiosdf_jax._src.command import map_stream
     from hiosdf_jax._src.command.map_frames import (
         NothingMappedError,
@@ -78,7 +78,7 @@ def run_mapping(
             map_path = str(map_stream.map_file(output, options.save))
             command, *rest = _without_resume(options.arguments)
             again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
-            print(f"stopped by {stop}; to go on:\n  {again}")
+            print(f"stopped by {stop}; to resume:\n  {again}")
     if live is not None:
         end_watch(options, live)
 

@@ -1,4 +1,4 @@
-"""Reads `.npz` files that nobody vouches for: each entry is checked before it is inflated.
+"""Reads untrusted `.npz` files: each entry is checked before it is inflated.
 
 An entry of a few bytes can inflate to gigabytes. The header inside it gives its type and shape, and
 only an entry of the right size is read. Nothing is unpickled.

@@ -63,7 +63,7 @@ def inflate(start: Callable[[], Any], data: bytes) -> bytes:
 def limit_rosbags() -> None:
     """Makes rosbags inflate chunks and messages by `inflate`, for the whole process.
 
-    Of itself it inflates a chunk whatever its size, before anything of it can be checked.
+    By default rosbags inflates a chunk of any size before it can be checked.
     """
     import lz4.frame
     import rosbags.rosbag1.reader

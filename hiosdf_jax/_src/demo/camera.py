@@ -31,7 +31,7 @@ class DepthCamera:
             model: The scene, in the model's initial configuration.
             width: Pixels per row.
             height: Pixels per column.
-            max_range: Most range of a return, m. The least is 0.3 m.
+            max_range: Largest range of a return, m. The least is 0.3 m.
             noise: Whether depths have a Kinect's noise, some pixels drop out, and some fly between
                 foreground and background at depth edges.
 

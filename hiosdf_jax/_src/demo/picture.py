@@ -62,7 +62,7 @@ def save_picture(path: str | os.PathLike[str], run: Run) -> None:
         image, ax=list(panels), label="distance of the body's axis [m]", shrink=0.9, extend="both"
     )
     rows[0].supxlabel(
-        "grey: not seen; dull: not seen at all heights of the body; black: surfaces in the map; "
+        "gray: not seen; dull: not seen at all heights of the body; black: surfaces in the map; "
         "green: driven; magenta: the way it means to go; orange: rollouts; star: goal",
         fontsize=10,
     )
@@ -154,7 +154,7 @@ def _draw_clearance(ax: Axes, run: Run) -> None:
     floor_cm = 100 * (ROBOT.heights[0] - ROBOT.radius)
     outcome = "reached" if run.metrics["reached"] else "not reached"
     ax.set(
-        xlabel="time [s] (on grey: turning to look around)",
+        xlabel="time [s] (on gray: turning to look around)",
         ylabel=f"clearance of the body [cm]\n(floor: {floor_cm:.0f})",
         xlim=(0, max(float(seconds[-1]), 1.0)),
         ylim=(min(-1.0, 110 * float(run.exact_clearance.min())), 22),

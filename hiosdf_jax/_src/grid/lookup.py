@@ -115,7 +115,7 @@ class Plane(NamedTuple):
     """The planes of the patches near points.
 
     Attributes:
-        height: Of the point above the plane, on the sensor's side, (N,) m.
+        height: Height of the point above the plane, on the sensor's side, (N,) m.
         normal: Unit vectors, (N, 3).
         beside: How far the point is from the patches' middle along the plane, (N,) m.
         width: The patches' standard deviation along their shorter side, (N,) m.

@@ -103,8 +103,8 @@ def grow(state: MapState, bounds: Any) -> MapState:
         before inside the old box.
 
     Raises:
-        ValueError: `state` is not a map, or traced; or the new bounds do not contain the old ones,
-            or are none.
+        ValueError: `state` is not a map, or traced; or the new bounds are invalid or do not contain
+            the old ones.
 
     Example:
         state = hio.grow(state, ((-5, -5, 0), (15, 10, 3)))  # it must contain the old box

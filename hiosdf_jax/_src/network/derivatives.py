@@ -31,9 +31,9 @@ def loss_gradient(
         weights: The sums of the batch's weights, `loss.weights`.
 
     Returns:
-        gradient: Of the loss times `loss.count(weights)`. A single sample's share of the mean would
-            vanish in float16.
-        sums: Of the losses, `loss.sums`.
+        gradient: Gradient of the loss times `loss.count(weights)`, since a single sample's share of
+            the mean would vanish in float16.
+        sums: Sums of the losses, as from `loss.sums`.
     """
     arguments = (params, points, samples, weights)
     by_xla = functools.partial(_by_xla, config)

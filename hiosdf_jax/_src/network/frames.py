@@ -17,7 +17,7 @@ def move_network(network: Network, pose: jax.Array) -> Network:
 
     The first layer computes (x - origin) K + b. With x = R^T (y - t) that is
     (y - (R origin + t)) (R K) + b, so the distances are the same up to rounding. AdamW's mean of
-    the gradients turns like K. Of its mean squares only the diagonal is known: they turn as those
+    the gradients turns like K. Only the diagonal of its mean squares is known: they turn as those
     of gradients whose components are independent.
 
     Args:

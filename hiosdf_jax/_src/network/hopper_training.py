@@ -59,9 +59,8 @@ class Factors(NamedTuple):
     Attributes:
         value: The values without the output's bias, (N,) float32.
         gradient: Their gradients by coordinate, (3, N) float32; undefined without slopes.
-        inputs: Of the hidden layers: the sines before them, and the loss by u, (L, P, N, D)
-            float16.
-        angles: Of the hidden layers: the loss by their angles, and r, (L, P, N, D) float16.
+        inputs: The sines before the hidden layers, and the loss by u, (L, P, N, D) float16.
+        angles: The loss by the hidden layers' angles, and r, (L, P, N, D) float16.
         last: As `inputs`, of the output layer, (P, N, D) float16.
         first: As `angles`, of the input layer, (P, N, D) float16.
     """

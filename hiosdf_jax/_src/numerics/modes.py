@@ -35,9 +35,9 @@ def plain[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 def pointwise[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Makes a traced function of points independent of the caller's modes, Explicit axes included.
 
-    In a mesh with Explicit axes, the type of an array tells how it is sharded, and a gather must be
-    told so for its result. The compiler shards these functions itself; the result is sharded as the
-    points are.
+    In a mesh with Explicit axes, the type of an array says how it is sharded, and a gather must get
+    the sharding of its result. The compiler shards these functions itself; the result is sharded
+    as the points are.
 
     Args:
         function: Its second argument is points (..., 3); its results have the axes (...) first.
@@ -65,7 +65,7 @@ def pointwise[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 def varying_like(start: Any, *others: Any) -> Any:
     """Gives constants that a loop starts from the type that they have after its first round.
 
-    Inside `jax.shard_map` the type of an array tells over which axes of the mesh it varies.
+    Inside `jax.shard_map` the type of an array says over which axes of the mesh it varies.
 
     Args:
         start: A pytree of arrays.

@@ -1,4 +1,4 @@
-"""Checks of what a caller may say beside a cloud: the robot's spheres, the sensor's noise."""
+"""Checks of the optional arguments of an update: the robot's spheres, the sensor's noise."""
 
 from __future__ import annotations
 

@@ -119,5 +119,5 @@ def checked_spheres(centers: Any, radii: Any, name: str) -> tuple[jax.Array, jax
             f"radii has shape {radii.shape}, expected one that broadcasts to {shape[:-1]}, "
             f"the spheres of {name}"
         )
-    # Inside jit a radius that is no radius is in collision: NaN would compare as clear.
+    # Inside jit an invalid radius is in collision: NaN would compare as clear.
     return centers, jnp.where((radii >= 0) & (radii <= _FAR), radii, _FAR) if traced else radii

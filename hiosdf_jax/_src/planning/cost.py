@@ -56,7 +56,7 @@ def collision_cost(clearance: Any, margin_m: Any) -> jax.Array:
 @jax.jit
 @plain
 def _cost(clearance: jax.Array, margin: jax.Array) -> jax.Array:
-    # Inside jit a margin that is none is as wide as any: no collision may cost nothing.
+    # Inside jit an invalid margin counts as the widest: every collision must cost something.
     margin = jnp.where((margin >= _LEAST_M) & (margin <= _MOST_M), margin, _MOST_M)
     # Clipped before squaring: an infinite clearance must not make the gradient NaN.
     shortfall = jnp.clip(margin - clearance, 0, margin)

@@ -140,7 +140,7 @@ def _checked(
     if not is_traced(slope):
         slope = as_number("slope", slope, 0, above=True)
     slope = on_device("slope", slope)
-    # Inside jit a slope that is none counts as steep: the motion is in collision.
+    # Inside jit an invalid slope counts as steep: the motion is in collision.
     slope = jnp.where((slope > 0) & (slope <= _STEEPEST), slope, _STEEPEST)
     return as_field(field), start, end, radii, slope
 

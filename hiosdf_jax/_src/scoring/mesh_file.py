@@ -1,6 +1,6 @@
-"""Reads mesh files that nobody vouches for: sizes before memory is taken, indices before use.
+"""Reads untrusted mesh files: sizes are checked before memory is taken, indices before use.
 
-Foreign code indexes corners by the numbers of the file without a look at them, in C++ too.
+Foreign code, in C++ too, indexes corners by the file's numbers without checking them.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def save_slices(
         bar |= {"aspect": 20}
         figure.colorbar(grid[0, 2].images[0], ax=grid[:, 2], label="error [cm]", **bar)
     notes = ["black: surface"]
-    notes += ["grey: not observed"] if observed is not None else []
+    notes += ["gray: not observed"] if observed is not None else []
     notes += ["green: path of the sensor, from the dot"] if path_world is not None else []
     figure.supxlabel("; ".join(notes), fontsize=9)
     with replacing(path) as file:

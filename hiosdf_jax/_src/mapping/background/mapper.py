@@ -64,7 +64,7 @@ class BackgroundMapper:
     Attributes:
         field: The newest snapshot, or what `serve` has made of it, with the stamp of its frame.
         serve: What to make of each snapshot. It may be replaced at any time, for instance to move a
-            window with the robot; the next frame that is fused is served by it.
+            window with the robot; it is used from the next fused frame on.
         dropped: Number of frames that newer ones replaced.
         rejected: Number of frames that left `field` and its stamp as they were: `update` raised an
             exception or refused them, or `serve` raised one.

@@ -132,7 +132,7 @@ def _add(first: EvidenceWindow, second: EvidenceWindow) -> EvidenceWindow:
 
     hidden = (first.passes < 0) | (second.passes < 0)
     passes = jnp.abs(first.passes) + jnp.abs(second.passes)
-    # Of two patches the newer; of two places without one that which changed last.
+    # The newer of two patches; without patches, the place that changed last.
     a, b = first.change, second.change
     recent = jnp.where(one | other, jnp.maximum(a, b), jnp.minimum(a, b))
     return EvidenceWindow(

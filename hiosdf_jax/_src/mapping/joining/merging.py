@@ -28,7 +28,7 @@ from hiosdf_jax._src.state import Flag, Grid, MapState, Network, check_single
 _SHARED = ("voxel_size", "range_noise", "hidden_width", "hidden_layers", "frequency")
 
 # After a merge the network learns what the other map knew, in this many trainings of
-# `Config.warmup_epochs` on samples of the whole grid. Half of the served weights stays in each.
+# `Config.warmup_epochs` on samples of the whole grid. Each keeps half of the old average.
 _TRAININGS = 10
 _AVERAGE = 0.5
 

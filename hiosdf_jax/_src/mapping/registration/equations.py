@@ -28,7 +28,7 @@ INLIER_DEVIATIONS = 3.0
 _OUTLIER_DEVIATIONS = INLIER_DEVIATIONS, 1.5
 
 # No patch is known better than this, m, and no return across its ray better than this, rad: pixels
-# and beams are that wide. Without it distant surfaces at grazing angles count too much.
+# and rays are that wide. Without it distant surfaces at grazing angles count too much.
 _LEAST_SIGMA_M = 0.006
 _ACROSS_RAD = 0.002
 
@@ -46,7 +46,7 @@ _TRIED_M = 0.2
 _LEAST_GROWTH = 0.004
 _LEAST_GROWTH_BAKED = 0.01
 
-# As many of the least determined directions are tried: a plane leaves three free.
+# This many of the least determined directions are tried: a plane leaves three free.
 _TRIED_DIRECTIONS = 3
 
 # Information of a free direction without a prior: a standard deviation of 100 m.
@@ -285,11 +285,11 @@ def balance(
 ) -> jax.Array:
     """Computes what is zero at the solution: the slopes of returns and anchor.
 
-    Returns tell nothing of free directions. There the prior decides, or the initial pose.
+    Returns do not constrain free directions. There the prior decides, or the initial pose.
 
     Args:
         directions: The principal directions of the returns' information.
-        slope: Of the returns, (6,).
+        slope: Slope of the returns' cost by the motion, (6,).
         anchor: What holds free directions.
         rows: The returns.
         pose: (4, 4).

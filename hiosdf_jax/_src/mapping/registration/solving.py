@@ -33,8 +33,8 @@ _COARSE_END_M = 0.03
 _COARSE_STEPS = 24
 _DAMPING = 1e-5
 
-# So many returns tell as much as one independent one. Against a prior, coarse steps must not trust
-# them more: their noisy normals tell of directions of which the surfaces tell nothing.
+# This many returns count as one independent return. Against a prior, coarse steps must not trust
+# them more: noisy normals seem to constrain directions that the surfaces do not constrain.
 _COARSE_INFLATION = 16.0
 
 # Rows are selected where surfaces may be this far off, m: those that contradict a pose that is not

@@ -61,7 +61,7 @@ def costmap(
         floor_m: Height of the floor, m, world frame.
         height_m: Height of the robot, m.
         radius_m: Radius of the robot, m.
-        step_m: What is lower than this above the floor is none of the robot's concern, m; at least
+        step_m: Surfaces up to this height above the floor are no obstacles, m; at least
             the resolution, or the floor itself would be an obstacle.
         resolution: Edge of a cell, m.
 
