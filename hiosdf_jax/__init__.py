@@ -10,7 +10,7 @@ from hiosdf_jax import planning
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.field.baking import bake
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.field.points import query, sdf, sdf_and_grad
+from hiosdf_jax._src.field.queries import query, sdf, sdf_and_grad
 from hiosdf_jax._src.mapping.background.mapper import BackgroundMapper
 from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget

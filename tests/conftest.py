@@ -5,7 +5,7 @@ import os
 import signal
 from pathlib import Path
 
-# XLA's compiler for CPUs takes a fifth less time without unrolling, and the programs are as fast.
+# XLA compiles an update in an eighth less time without unrolling, and the program is as fast.
 # Commands and notebooks that tests start inherit this.
 _FLAGS = (
     "--xla_backend_optimization_level=1 "

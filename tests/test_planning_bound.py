@@ -8,7 +8,7 @@ from room import BOUNDS, HALF
 
 import hiosdf_jax as hio
 from hiosdf_jax import planning
-from hiosdf_jax._src.field import points as queries
+from hiosdf_jax._src.field import queries
 
 COUNT = 2000  # as many as in other tests: one compilation
 RADII = np.full(COUNT, 0.05, np.float32)

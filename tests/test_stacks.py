@@ -27,7 +27,7 @@ What has failed in users' stacks, and the test of it. Those without a file are i
     test_answers_are_float32_with_x64
 - a stacked map without vmap
     test_a_stack_of_maps_is_refused_with_a_word_on_vmap
-    test_a_stack_of_maps_is_refused_by_update_and_bake
+    test_a_stack_of_maps_is_refused_by_what_takes_one_map
 - clouds of many sizes in jit(update)
     test_mapping_input.test_a_padded_cloud_is_what_update_maps
     test_mapping_input.test_pad_cloud_refuses_what_update_refuses
@@ -61,6 +61,8 @@ What has failed in users' stacks, and the test of it. Those without a file are i
     test_demo_apartment.test_rays_stop_at_the_first_surface
 """
 
+import functools
+
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -71,7 +73,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from room import arrays_equal, stream
 
 import hiosdf_jax as hio
-from hiosdf_jax import planning
+from hiosdf_jax import exports, planning
 
 COUNT = 2000  # as many as in other tests: one compilation
 POINTS = np.random.default_rng(0).uniform(-0.8, 0.8, (COUNT, 3)).astype(np.float32)
@@ -305,12 +307,18 @@ def test_a_stack_of_maps_is_refused_with_a_word_on_vmap(fields, kind):
     np.testing.assert_allclose(both[1], hio.sdf(fields[kind], POINTS), atol=1e-5)
 
 
-def test_a_stack_of_maps_is_refused_by_update_and_bake(empty_map):
+def test_a_stack_of_maps_is_refused_by_what_takes_one_map(empty_map, tmp_path):
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), empty_map)
     with pytest.raises(ValueError, match=r"state .* jax\.vmap"):
         hio.update(stack, *stream(1)[0])
-    with pytest.raises(ValueError, match=r"field .* jax\.vmap"):
-        hio.bake(hio.snapshot(stack))
+    exported = functools.partial(exports.export_map, tmp_path / "map.npz")
+    costmap = functools.partial(exports.costmap, floor_m=-0.8, height_m=1.0, radius_m=0.2)
+    for function in (hio.bake, hio.extract_mesh, hio.view, exported, costmap, exports.voxel_grid):
+        for field in (stack, hio.snapshot(stack)):
+            with pytest.raises(ValueError, match=r"field .* jax\.vmap"):
+                function(field)
+        with pytest.raises(ValueError, match="field is dict, expected a MapState or a Field"):
+            function({})
 
 
 @pytest.mark.parametrize(

@@ -191,8 +191,6 @@ class Config:
             if whole and not number.is_integer():
                 raise ValueError(f"Config.{name} is {value!r}, expected a whole number")
             object.__setattr__(self, name, int(number) if whole else number)
-        if not (0 < floor < math.inf and 0 <= growth < math.inf):
-            raise ValueError(f"Config.range_noise is {noise!r}, expected a > 0 and b >= 0")
         if self.max_range <= self.min_range:
             raise ValueError(
                 f"Config.max_range is {self.max_range!r}, expected more than min_range, "

@@ -423,3 +423,22 @@ def field_of(state: MapState) -> Field:
         updates=state.updates,
         stamp=scalar(0),
     )
+
+
+def as_live_field(field: MapState | Field) -> Field:
+    """Selects what queries read of a map or of a snapshot, without a copy.
+
+    Args:
+        field: A map or a snapshot of one.
+
+    Returns:
+        The field.
+
+    Raises:
+        ValueError: The argument is something else, such as a baked field, or a stack of maps
+            outside `jax.vmap`.
+    """
+    if not isinstance(field, MapState | Field):
+        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    check_single("field", field)
+    return field_of(field) if isinstance(field, MapState) else field

@@ -25,7 +25,7 @@ from hiosdf_jax._src.demo.geodesic import (
     survey,
 )
 from hiosdf_jax._src.demo.robot import Robot, braking, clearance, motion
-from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.planning.adapters import mppi
 
 _ROUNDING = 1e-5  # m, of a distance

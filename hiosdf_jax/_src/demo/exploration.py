@@ -25,7 +25,7 @@ from hiosdf_jax._src.demo.sensing import (
     robot_camera,
     scan_from_above,
 )
-from hiosdf_jax._src.field.points import Unknown
+from hiosdf_jax._src.field.queries import Unknown
 from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.state import Field
 

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.demo.robot import Robot, body
-from hiosdf_jax._src.field.points import AnyField, query
+from hiosdf_jax._src.field.queries import AnyField, query
 
 PathFrom = Callable[[np.ndarray], np.ndarray]
 """(2,) m -> (P, 2) m, the cheapest path from a point to the goal."""

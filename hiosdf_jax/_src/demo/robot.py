@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, sdf
+from hiosdf_jax._src.field.queries import AnyField, Unknown, sdf
 from hiosdf_jax._src.numerics.gradient import least
 
 _SUBSTEPS = 4  # integration steps per control step

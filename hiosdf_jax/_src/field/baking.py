@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.lattice import sample_counts
-from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.field.queries import query
 from hiosdf_jax._src.numerics.arrays import on_device, scalar
 from hiosdf_jax._src.numerics.intake import as_real, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
-from hiosdf_jax._src.state import Baked, Field, MapState, check_single, field_of
+from hiosdf_jax._src.state import Baked, Field, MapState, as_live_field
 
 _CHUNK = 65536  # samples at a time: activations are many times larger than a sample
 
@@ -48,11 +48,7 @@ def bake(
     Example:
         >>> baked = hio.bake(field, resolution=0.05, center=robot_position, size=(4, 4, 2))
     """
-    if isinstance(field, MapState):
-        field = field_of(field)
-    if not isinstance(field, Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
-    check_single("field", field)
+    field = as_live_field(field)
     if (center is None) != (size is None):
         raise ValueError("center and size define a window, expected both or neither")
     if size is None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from hiosdf_jax._src.field import points
+from hiosdf_jax._src.field import queries
 from hiosdf_jax._src.state import Field
 
 
@@ -25,11 +25,11 @@ class CompiledQueries:
 
     def sdf(self, points_world: Any) -> jax.Array:
         """Signed distances (...) m at points (..., 3) m."""
-        return points.sdf(self.field, points_world)
+        return queries.sdf(self.field, points_world)
 
     def sdf_and_grad(self, points_world: Any) -> tuple[jax.Array, jax.Array]:
         """Signed distances (...) m and gradients (..., 3) at points (..., 3) m."""
-        return points.sdf_and_grad(self.field, points_world)
+        return queries.sdf_and_grad(self.field, points_world)
 
     def lower(self, points_world: Any) -> jax.Array:
         """Lower bounds of the distance, (...) m, at points (..., 3) m."""
@@ -41,5 +41,5 @@ class CompiledQueries:
 
 
 # The field is an argument, so that each compiles once for all fields of one configuration.
-_lower = jax.jit(lambda field, points_world: points.query(field, points_world).lower)
-_observed = jax.jit(lambda field, points_world: points.query(field, points_world).observed)
+_lower = jax.jit(lambda field, points_world: queries.query(field, points_world).lower)
+_observed = jax.jit(lambda field, points_world: queries.query(field, points_world).observed)

@@ -14,7 +14,7 @@ from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.state import Field, MapState, field_of
+from hiosdf_jax._src.state import Field, MapState, as_live_field
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,10 +53,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     import trimesh
 
     spacing = check_resolution(resolution)
-    if isinstance(field, MapState):
-        field = field_of(field)
-    if not isinstance(field, Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    field = as_live_field(field)
     if is_traced(*jax.tree.leaves(field)):
         raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
     config, surface = field.config, field.surface

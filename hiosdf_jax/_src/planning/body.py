@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.planning.clearance import sphere_clearance_and_grad
 from hiosdf_jax._src.state import Bound

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, distance, distance_and_grad
+from hiosdf_jax._src.field.queries import AnyField, Unknown, distance, distance_and_grad
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import check_vectors, is_traced
 from hiosdf_jax._src.numerics.modes import plain

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, as_field, distance
+from hiosdf_jax._src.field.queries import AnyField, Unknown, as_field, distance
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import as_number, check_whole, is_traced
 from hiosdf_jax._src.numerics.modes import plain, pointwise, varying_like

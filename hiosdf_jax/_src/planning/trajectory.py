@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from hiosdf_jax._src.field.points import AnyField, Unknown, distance_and_grad
+from hiosdf_jax._src.field.queries import AnyField, Unknown, distance_and_grad
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.gradient import least
 from hiosdf_jax._src.numerics.intake import as_key, as_number, check_whole, is_traced

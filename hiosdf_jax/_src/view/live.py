@@ -15,7 +15,7 @@ import numpy as np
 from hiosdf_jax._src.mapping.checkpoint import save
 from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.planning.clearance import checked_spheres
-from hiosdf_jax._src.state import Field, MapState, field_of
+from hiosdf_jax._src.state import Field, MapState, as_live_field
 from hiosdf_jax._src.view import colors, moments, page, scene, serving, stage
 
 _UP = (0.0, 0.0, 1.0)
@@ -59,9 +59,7 @@ def view(
         >>> viewer.show(hio.snapshot(state), cloud, pose)  # later
         >>> viewer.export("scene.html")
     """
-    shown = field_of(field) if isinstance(field, MapState) else field
-    if not isinstance(shown, Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    shown = as_live_field(field)
     keep = None if isinstance(field, Field) else functools.partial(_save_to, "map.npz", field)
     viewer = Viewer(exact_sdf=exact_sdf, up_world=up_world, host=host, port=port, on_save=keep)
     if spheres is not None:

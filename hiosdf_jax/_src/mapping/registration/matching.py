@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.field.points import query
+from hiosdf_jax._src.field.queries import query
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.mapping.registration.motion import offsets_from
 from hiosdf_jax._src.numerics.vectors import split

@@ -9,7 +9,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, as_field
+from hiosdf_jax._src.field.queries import AnyField, as_field
 from hiosdf_jax._src.mapping.registration.equations import (
     GROWING_REACH_M,
     Anchor,

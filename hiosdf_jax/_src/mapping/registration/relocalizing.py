@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, as_field
+from hiosdf_jax._src.field.queries import AnyField, as_field
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.mapping.registration.equations import (
     Anchor,

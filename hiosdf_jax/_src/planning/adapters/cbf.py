@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.intake import as_number, as_real
 from hiosdf_jax._src.planning.body import BodySpheres
 from hiosdf_jax._src.planning.clearance import checked_spheres, sphere_clearance

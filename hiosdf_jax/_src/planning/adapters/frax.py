@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.gradient import least, value_and_gradient
 from hiosdf_jax._src.numerics.intake import as_array
 from hiosdf_jax._src.planning.clearance import sphere_clearance

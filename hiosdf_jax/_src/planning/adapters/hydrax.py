@@ -17,7 +17,7 @@ from hydrax.alg_base import (  # pyright: ignore[reportMissingImports]
 )
 from mujoco import mjx
 
-from hiosdf_jax._src.field.points import AnyField
+from hiosdf_jax._src.field.queries import AnyField
 
 
 def optimizer(

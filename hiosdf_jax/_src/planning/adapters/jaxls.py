@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxls import Cost, Var  # pyright: ignore[reportMissingImports]
 
-from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.planning.body import clearance_and_jacobian
 from hiosdf_jax._src.state import Bound

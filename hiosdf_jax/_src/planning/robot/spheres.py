@@ -16,7 +16,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field.points import AnyField, Unknown
+from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.exporting import exportable
 from hiosdf_jax._src.numerics.gradient import least

@@ -10,7 +10,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.baking import bake
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.state import Field, MapState, field_of
+from hiosdf_jax._src.state import Field, MapState, as_live_field
 from hiosdf_jax._src.view import moments, page, stage
 from hiosdf_jax._src.view.exports import lattices, meshes, navigation, weights
 
@@ -56,10 +56,7 @@ def export_map(
         ModuleNotFoundError: The format needs a package that is not installed.
     """
     suffix = check_suffix(path)
-    if isinstance(field, MapState):
-        field = field_of(field)
-    if not isinstance(field, Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    field = as_live_field(field)
     if suffix in COSTMAPS:
         missing = {"floor_m", "height_m", "radius_m"} - robot.keys()
         if missing:

@@ -13,7 +13,7 @@ from hiosdf_jax._src.field.baking import bake
 from hiosdf_jax._src.field.lattice import check_resolution
 from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import Field, MapState
+from hiosdf_jax._src.state import Field, MapState, as_live_field
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 128
 _OCCUPIED_FROM, _FREE_BELOW = 0.65, 0.196
@@ -76,8 +76,7 @@ def costmap(
     radius = as_number("radius_m", radius_m, 0)
     step = as_number("step_m", step_m, cell)
     height = as_number("height_m", height_m, step, above=True)
-    if not isinstance(field, MapState | Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    field = as_live_field(field)
     low, high = np.asarray(field.config.bounds, float)
     bottom, top = floor + step, floor + height
     if bottom < low[2] or top > high[2]:

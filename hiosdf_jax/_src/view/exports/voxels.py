@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.field import points
+from hiosdf_jax._src.field import queries
 from hiosdf_jax._src.field.lattice import check_resolution, sample_counts
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
-from hiosdf_jax._src.state import Field, MapState, Unknown
+from hiosdf_jax._src.state import Field, MapState, Unknown, as_live_field
 
 _CHUNK = 65536
 
@@ -54,8 +54,7 @@ def voxel_grid(
         ValueError: An argument has a wrong type or value, or the grid has too many voxels.
     """
     edge = check_resolution(voxel_size)
-    if not isinstance(field, MapState | Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
+    field = as_live_field(field)
     low, high = np.asarray(field.config.bounds, float)
     shape = np.array(sample_counts(high - low, edge)) - 1  # voxels, not their corners
     count = int(shape.prod())
@@ -64,7 +63,7 @@ def voxel_grid(
     def sample(row: np.ndarray) -> tuple[np.ndarray]:
         index = np.stack(np.unravel_index(row, shape), axis=-1)
         centers_world = (low + (index + 0.5) * edge).astype(np.float32)
-        return (-np.asarray(points.sdf(field, centers_world, unknown=unknown)),)
+        return (-np.asarray(queries.sdf(field, centers_world, unknown=unknown)),)
 
     fill_in_chunks(sample, {"sdf": inside}, min(count, _CHUNK))
     dims = shape * edge
