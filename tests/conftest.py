@@ -5,16 +5,6 @@ import os
 import signal
 from pathlib import Path
 
-# XLA compiles an update in an eighth less time without unrolling, and the program is as fast.
-# Commands and notebooks that tests start inherit this.
-_FLAGS = (
-    "--xla_backend_optimization_level=1 "
-    "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling,xla_cpu_disable_slp_vectorizer"
-)
-_given = os.environ.get("XLA_FLAGS", "")
-if _FLAGS not in _given:
-    os.environ["XLA_FLAGS"] = f"{_given} {_FLAGS}".strip()
-
 import jax
 import pytest
 

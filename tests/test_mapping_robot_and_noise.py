@@ -45,7 +45,12 @@ def test_returns_on_the_robot_change_nothing(empty_map):
     actual = update(empty_map, covered, pose, (CENTERS, RADII))
     for part in ("grid", "network", "optimism"):
         assert arrays_equal(getattr(actual, part), getattr(expected, part)), part
-    assert arrays_equal(actual.grid, hio.update(empty_map, without, pose).grid)  # without a robot
+    # Without a robot, and with a robot alone.
+    plain = hio.update(empty_map, without, pose)
+    assert arrays_equal(actual.grid, plain.grid)
+    alone = hio.update(empty_map, covered, pose, robot=(CENTERS, RADII))
+    for part in ("grid", "network", "optimism"):
+        assert arrays_equal(getattr(alone, part), getattr(plain, part)), part
     assert int(actual.report.points_used) == int(expected.report.points_used)
     assert int(actual.report.points_out_of_range) == 0  # the arm's returns are in range
     ghost = hio.update(empty_map, covered, pose)
@@ -138,7 +143,7 @@ def test_hits_are_weighted_by_the_noise_of_their_cloud(empty_map):
 def test_the_configurations_noise_is_the_default(empty_map):
     cloud, pose = room_cloud(0)
     plain = hio.update(empty_map, cloud, pose)
-    given = update(empty_map, cloud, pose)
+    given = hio.update(empty_map, cloud, pose, noise=CONFIG.range_noise)
     assert arrays_equal(given.grid.evidence.hits, plain.grid.evidence.hits)
     points = np.random.default_rng(0).uniform(-0.9, 0.9, (200, 3)).astype(np.float32)
     np.testing.assert_allclose(distances(given, points), distances(plain, points), atol=2e-3)

@@ -2,6 +2,7 @@
 
 import datetime
 import decimal
+import inspect
 import tempfile
 import warnings
 
@@ -435,4 +436,5 @@ def test_traced_margins_and_slopes_that_are_none_never_make_a_collision_free(emp
     assert cost(-0.5, wrong) >= 0.5 and cost(0.05, wrong) > 0
     start, end = jnp.zeros((1, 3)), jnp.full((1, 3), 0.1)
     swept = jax.jit(lambda slope: planning.swept_clearance(empty_map, start, end, 0.1, slope=slope))
-    assert (swept(wrong) <= swept(1.1)).all()  # the default
+    default = inspect.signature(planning.swept_clearance).parameters["slope"].default
+    assert (swept(wrong) <= swept(default)).all()

@@ -44,9 +44,11 @@ def test_first_true_ravels_and_batches(shape: tuple[int, ...]) -> None:
         assert (np.asarray(row[len(expected) :]) == count).all()
 
 
+@pytest.mark.parametrize("device", ["cpu", "gpu"])
 @pytest.mark.parametrize("size", [1, 2, 31, 1000])
 @pytest.mark.parametrize("dtype", [np.int32, np.float32])
-def test_running_sums_and_bisection_are_those_of_numpy(size: int, dtype: type) -> None:
+def test_running_sums_and_bisection_are_those_of_numpy(monkeypatch, device, size, dtype) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
     values = np.random.default_rng(size).integers(0, 3, size).astype(dtype)
     sums = masks.running_sum(values)
     assert sums.dtype == dtype

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.mapping.registration import equations, solving
 
 RESOLUTION = 0.05
 NOISE = (0.01, 0.0)
@@ -359,5 +360,52 @@ def test_types_do_not_depend_on_the_modes_of_jax(sharp_map):
     with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"):
         found = jax.eval_shape(lambda: hio.refine_pose(sharp_map, jnp.asarray(cloud), pose))
         _, tracked = jax.eval_shape(lambda state: hio.track(state, cloud, pose), sharp_map)
-    for answer in (found, tracked):
+        prior = (np.eye(4), np.eye(6))
+        held = jax.eval_shape(lambda: hio.refine_pose(sharp_map, cloud, pose, prior))
+    for answer in (found, tracked, held):
         assert [part.dtype for part in answer] == 4 * [jnp.float32] + [bool]
+
+
+def test_vmap_over_poses_and_a_scan_of_single_clouds_trace(sharp_map):
+    cloud, pose = room_cloud(3, COUNT)
+    poses = np.stack([pose] * 3)
+    many = jax.eval_shape(jax.vmap(hio.refine_pose, (None, None, 0)), sharp_map, cloud, poses)
+
+    def step(pose, cloud):
+        found = hio.refine_pose(sharp_map, cloud, pose)
+        return found.pose, found
+
+    last, each = jax.eval_shape(lambda: jax.lax.scan(step, pose, np.stack([cloud] * 3)))
+    assert last.shape == (4, 4)
+    for found in (many, each):
+        assert [part.shape for part in found] == [(3, 4, 4), (3, 6, 6), (3,), (3,), (3,)]
+
+
+@pytest.mark.parametrize(
+    "step_m, steps, rests",
+    [(0.003, 24, False), (0.0015, 24, True), (8e-6, 24, True), (4e-6, 8, True)],
+)
+def test_a_pose_rests_by_the_length_of_its_whole_steps(monkeypatch, step_m, steps, rests):
+    """Late steps are halved. That must not make a pose that still moves look as if it rested."""
+    rows = equations.make_rows(jnp.ones((1, 3)), jnp.ones(1, bool), (0.01, 0.001))
+    made = []
+
+    def find_step(*_):
+        jax.debug.callback(lambda: made.append(1))
+        return jnp.zeros(6).at[0].set(step_m)
+
+    def nothing(_, rows, pose, scale_m):
+        zero = jnp.zeros(1)
+        flag = jnp.zeros(1, bool)
+        world = jnp.zeros((1, 3)) + 0 * pose[0, 3] + 0 * scale_m
+        return equations.Residuals(zero, jnp.zeros((1, 6)), zero, flag, flag, zero, world)
+
+    monkeypatch.setattr(solving, "find_step", find_step)
+    monkeypatch.setattr(solving, "compare", nothing)
+    directions, anchor = equations.no_free_directions(), equations.Anchor(jnp.eye(4), None)
+    found = solving.solve_fine(None, rows, jnp.eye(4), directions, anchor)
+    jax.effects_barrier()
+    assert bool(found.rests) == rests
+    assert len(made) == steps + 1  # the first one stays in place
+    whole, half = min(steps, 16), max(steps - 16, 0)
+    np.testing.assert_allclose(found.pose[0, 3], step_m * (whole + half / 2), rtol=1e-4)

@@ -12,7 +12,8 @@ import numpy as np
 from hiosdf_jax._src.command.timing import format_number, host_name, points_in, time_calls
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
-from hiosdf_jax._src.field import baking, points
+from hiosdf_jax._src.field import baking
+from hiosdf_jax._src.field.queries import sdf_and_grad
 from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.scoring.table import lay_out
 
@@ -70,12 +71,12 @@ def measure(
     later_ms = 1e3 * updates_s[max(config.warmup_updates, 1) :]  # the first ones train longer
     field, where = lifecycle.snapshot(state), points_in(config, queries)
     bar.set_description("distances")
-    queries_ms = time_calls(points.sdf_and_grad, field, where, seconds=seconds)
+    queries_ms = time_calls(sdf_and_grad, field, where, seconds=seconds)
     step("baking")
     baking_ms = time_calls(baking.bake, field, resolution, seconds=seconds / 4)
     step("baked distances")
     baked = baking.bake(field, resolution)
-    baked_ms = time_calls(points.sdf_and_grad, baked, where, seconds=seconds)
+    baked_ms = time_calls(sdf_and_grad, baked, where, seconds=seconds)
     bar.close()
 
     memory_mb = 1e-6 * sum(leaf.nbytes for leaf in jax.tree.leaves(state))

@@ -110,6 +110,6 @@ def draw_from_masks(
 
 
 def draw_from_mask(mask: jax.Array, words: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Does the same for one mask (...) and random words (N,): indices (N,), possible ()."""
+    """Draws as `draw_from_masks` from one mask (...) by words (N,): indices (N,), possible ()."""
     (index,), (possible,) = draw_from_masks([mask], [words])
     return index, possible

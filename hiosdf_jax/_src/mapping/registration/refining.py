@@ -52,9 +52,9 @@ class Registration(NamedTuple):
 
     Attributes:
         pose: (4, 4) float32, T_world_sensor.
-        covariance: Its covariance, (6, 6) float32: the translation, m, and then the rotation about
-            the sensor, rad, both along the axes of the world frame. Directions that the cloud does
-            not determine have a standard deviation of 100 m, or that of the prior.
+        covariance: That of the pose's error, (6, 6) float32: the translation, m, and then the
+            rotation about the sensor, rad, both along the axes of the world frame. Directions that
+            the cloud does not determine have a standard deviation of 100 m, or that of the prior.
         residual: Root mean square distance of the inliers from the surface, () float32, m.
         inliers: Share of the returns in observed space that lie on a surface, () float32.
         converged: The steps came to rest, and enough returns support the pose, () bool; see

@@ -133,7 +133,8 @@ def solve_fine(
     """Steps until the pose stays where it is.
 
     A prior counts by its covariance, so returns must not count as independent of each other. How
-    far they are is measured where the first steps end. Then the pose is solved again.
+    much they depend on each other is measured where the first steps end. Then the pose is solved
+    again.
 
     Args:
         field: The map.
@@ -181,11 +182,10 @@ def _rest(
     def step(carry: tuple[jax.Array, Residuals, jax.Array, jax.Array]) -> tuple:
         pose, residuals, _, count = carry
         motion = find_step(residuals, directions, anchor, rows, pose, solution.inflation)
-        motion = jnp.where(count <= _WHOLE_STEPS, motion, 0.5 * motion)
-        motion = jnp.where(count > 0, motion, 0)
-        pose = move(pose, motion)
-        residuals = compare(field, rows, pose, tolerance(count))
         way = jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
+        motion = jnp.where(count <= _WHOLE_STEPS, motion, 0.5 * motion)
+        pose = move(pose, jnp.where(count > 0, motion, 0))
+        residuals = compare(field, rows, pose, tolerance(count))
         return pose, residuals, jnp.where(count > 0, way, jnp.inf), count + 1
 
     def continues(carry: tuple[jax.Array, Residuals, jax.Array, jax.Array]) -> jax.Array:
