@@ -42,8 +42,7 @@ class RankedMask(NamedTuple):
 
 def rank_mask(mask: jax.Array) -> RankedMask:
     """Packs a mask (...), not empty, into words and counts its True elements."""
-    words = pack_mask(mask)
-    return RankedMask(words, count_bits(words))
+    return rank_words(pack_mask(mask))
 
 
 def pack_mask(mask: jax.Array) -> jax.Array:
@@ -53,9 +52,9 @@ def pack_mask(mask: jax.Array) -> jax.Array:
     return jnp.sum(bits << jnp.arange(WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
 
 
-def count_bits(words: jax.Array) -> jax.Array:
-    """Counts the bits that are set up to the end of each word, (W,) int32."""
-    return running_sum(jax.lax.population_count(words).astype(jnp.int32))
+def rank_words(words: jax.Array) -> RankedMask:
+    """Counts the True elements of a packed mask, or of several, one after the other."""
+    return RankedMask(words, running_sum(jax.lax.population_count(words).astype(jnp.int32)))
 
 
 def running_sum(values: jax.Array) -> jax.Array:

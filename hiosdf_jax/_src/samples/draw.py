@@ -11,13 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.masks import (
-    WORD,
-    RankedMask,
-    count_bits,
-    indices_of_true,
-    pack_mask,
-)
+from hiosdf_jax._src.numerics.masks import WORD, indices_of_true, pack_mask, rank_words
 
 
 class Samples(NamedTuple):
@@ -40,7 +34,7 @@ def concatenate(*parts: Samples) -> Samples:
 
 
 def draw_words(key: jax.Array, *shapes: tuple[int, ...]) -> list[jax.Array]:
-    """Draws random words by one call of the generator: each call is ten kernels on a CPU.
+    """Draws random words by one call of JAX's generator, which is ten kernels on a CPU.
 
     Args:
         key: Source of randomness.
@@ -86,25 +80,20 @@ def draw_from_masks(
     """
     packed = [pack_mask(mask) for mask in masks]
     ends = np.cumsum([part.size for part in packed])
-    whole = jnp.concatenate(packed)
-    ranked = RankedMask(whole, count_bits(whole))
+    ranked = rank_words(jnp.concatenate(packed))
     counts = [jnp.zeros((), jnp.int32), *(ranked.rank[end - 1] for end in ends)]
     totals = [after - before for before, after in itertools.pairwise(counts)]
     # `randint` has no bias of total / 2^32, and takes three times as long to compile.
     numbers = [
         (bits % jnp.maximum(total, 1).astype(jnp.uint32)).astype(jnp.int32) + before
-        for bits, total, before in zip(words, totals, counts, strict=False)
+        for bits, total, before in zip(words, totals, counts[:-1], strict=True)
     ]
     found = indices_of_true(ranked, jnp.concatenate(numbers))
+    parts = jnp.split(found, np.cumsum([bits.size for bits in words])[:-1])
+    firsts = [0, *(WORD * end for end in ends.tolist()[:-1])]  # each mask's first element
     indices = [
-        jnp.clip(part - WORD * (end - length.size), 0, mask.size - 1)
-        for part, end, length, mask in zip(
-            jnp.split(found, np.cumsum([bits.size for bits in words])[:-1]),
-            ends.tolist(),
-            packed,
-            masks,
-            strict=True,
-        )
+        jnp.clip(part - first, 0, mask.size - 1)
+        for part, first, mask in zip(parts, firsts, masks, strict=True)
     ]
     return indices, [total > 0 for total in totals]
 

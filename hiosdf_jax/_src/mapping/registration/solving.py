@@ -177,8 +177,8 @@ def _rest(
         scale_m = start_m * _FINE_SHRINK ** count.astype(jnp.float32)
         return jnp.where(scale_m > _FINE_END_M, scale_m, 0)
 
-    # A step begins where the last one has compared the returns. So the loop's body is the only
-    # place that compares them, which halves the time to compile. The first step stays in place.
+    # A step begins with the returns that the last one has compared, and the first one stays in
+    # place. So they are compared at one place of the program: each takes seconds to compile.
     def step(carry: tuple[jax.Array, Residuals, jax.Array, jax.Array]) -> tuple:
         pose, residuals, _, count = carry
         motion = find_step(residuals, directions, anchor, rows, pose, solution.inflation)
