@@ -245,6 +245,20 @@ def test_vanished_places_are_forgotten_after_eight_scans_that_pass_them():
     np.testing.assert_array_equal(vanishing.is_recent(old), expected)
 
 
+def test_only_changed_voxels_that_the_cloud_looked_at_are_counted():
+    window = patch()
+    for _ in range(2):
+        before = window
+        window, _ = scan(window, through(ALL))
+    assert int(vanishing.count_changed(before, window)) == 1
+    # The mark stays where no ray passes, but is no news there.
+    elsewhere, _ = scan(window, through(ASIDE))
+    assert int(elsewhere.change[CELL]) == int(window.change[CELL])
+    assert int(vanishing.count_changed(window, elsewhere)) == 0
+    again, _ = scan(elsewhere, through(ALL))
+    assert int(vanishing.count_changed(elsewhere, again)) == 1
+
+
 def test_rays_that_are_not_in_range_change_nothing():
     rays = rays_of(through(ALL))._replace(in_range=jnp.zeros(600, bool))
     window = patch()._replace(change=jnp.zeros(SHAPE, jnp.int8).at[CELL].set(5))

@@ -159,6 +159,23 @@ def is_recent(change: jax.Array) -> jax.Array:
     return (change > 0) | (change < _FORGOTTEN)
 
 
+def count_changed(before: EvidenceWindow, window: EvidenceWindow) -> jax.Array:
+    """Counts the voxels that a cloud looked at where a surface has just appeared or vanished.
+
+    Voxels that no ray has met since they changed are not counted: they keep their mark until then,
+    and would look like a change for ever.
+
+    Args:
+        before: The evidence before the cloud.
+        window: The evidence with the cloud's hits and passes.
+
+    Returns:
+        Their number, () int32.
+    """
+    looked_at = (window.hits > before.hits) | (window.passes > jnp.abs(before.passes))
+    return jnp.sum(is_recent(window.change) & looked_at, dtype=jnp.int32)
+
+
 def _look(
     config: Config, window: EvidenceWindow, rays: Rays, view: View, row: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

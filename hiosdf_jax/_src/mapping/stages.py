@@ -62,6 +62,7 @@ class Step(NamedTuple):
         novelty: The cloud compared with the map before it.
         before: The evidence around the sensor before this cloud, float32.
         window: The same with this cloud.
+        changed: Voxels that the cloud saw change, () int32.
         samples: Training samples.
         losses: Mean losses of the last epoch.
         trained: Whether training was finite, () bool.
@@ -80,6 +81,7 @@ class Step(NamedTuple):
     novelty: novelty.Novelty = _LATER
     before: evidence.EvidenceWindow = _LATER
     window: evidence.EvidenceWindow = _LATER
+    changed: jax.Array = _LATER
     samples: Samples = _LATER
     losses: loss.Losses = _LATER
     trained: jax.Array = _LATER
@@ -181,7 +183,8 @@ def renew_evidence(step: Step) -> Step:
     window = vanishing.drop_vanished(config, before, window, placed, view, step.state.updates)
     if step.robot is not None:
         window = robot.clear_robot(config, window, *step.robot)
-    return step._replace(window=_with_patches(window, step.window))
+    changed = vanishing.count_changed(before, window)
+    return step._replace(window=_with_patches(window, step.window), changed=changed)
 
 
 def fade_evidence(step: Step) -> Step:
@@ -226,8 +229,8 @@ def sample_cloud(step: Step) -> Step:
 
 def train(step: Step) -> Step:
     """Fits the network to the samples (IV-D)."""
-    known = held(step.state.grid.evidence)
-    changed = jnp.sum(vanishing.is_recent(known.change)) / jnp.maximum(jnp.sum(known.hits > 0), 1)
+    surface = jnp.sum(held(step.state.grid.evidence).hits > 0)
+    changed = step.changed / jnp.maximum(surface, 1)
     extra_epochs, average = training.schedule(step.config, step.state.updates, changed)
     network, losses, trained = training.train(
         step.config, held(step.state.network), step.samples, extra_epochs, average, step.keys.order
