@@ -2,8 +2,10 @@
 
     python -m benchmarks.registration
     python -m benchmarks.registration --stream ../shared/data/house_depth.npz --tries 10
+    python -m benchmarks.registration --between 200 --tries 1
 
-Without `--stream` the frames are those of the demo's camera. `--map` takes a saved map, made of all
+Without `--stream` the frames are those of the demo's camera. `--between` takes this many poses on
+its path instead, almost all between the frames of the map. `--map` takes a saved map, made of all
 frames but the held-out ones, instead of making it.
 """
 
@@ -83,6 +85,7 @@ def main():
     parser.add_argument("--stream", type=Path, help="a recording; the demo's camera by default")
     parser.add_argument("--map", type=Path, help="a saved map without the held-out frames")
     parser.add_argument("--tries", type=int, default=10, help="perturbations per frame")
+    parser.add_argument("--between", type=int, default=0, help="poses between the demo's frames")
     arguments = parser.parse_args()
     stream = demo.ApartmentStream(80)
     if arguments.stream:
@@ -91,6 +94,9 @@ def main():
     state = hio.load(arguments.map) if arguments.map else make_map(stream, held_out)
     field = hio.snapshot(state)
     frames = [stream[i] for i in held_out]
+    if arguments.between:
+        dense = demo.ApartmentStream(arguments.between)
+        frames = [dense[i] for i in range(len(dense))]
     print("| off by | poses | median, cm | 95 %, cm | most, cm | median, deg | 95 %, deg |", end="")
     print(" normalized square, 6 expected | converged | ms |")
     print("| --- " * 10 + "|")

@@ -1,17 +1,20 @@
 """The weights of returns, in a complete map and in one that grows."""
 
+import dataclasses
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import room_cloud
+from room import CONFIG, HALF, room_cloud
 
+import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.registration.equations import compare, make_rows
 from hiosdf_jax._src.state import field_of
 
 COUNT = 1000
+SHEET_CONFIG = dataclasses.replace(CONFIG, max_points=COUNT)
 
 
 @partial(jax.jit, static_argnames="scale_m")
@@ -56,3 +59,42 @@ def test_a_return_as_far_as_the_scale_keeps_the_same_weight(sharp_map):
     both = np.asarray(complete.comparable & grows.comparable)
     ratio = [np.asarray(each.weight * each.sigma**2)[both] for each in (complete, grows)]
     np.testing.assert_allclose(ratio[0], ratio[1], rtol=0.01)
+
+
+def on_wall():
+    """Returns on the wall at x = HALF[0], not near its edges, world frame."""
+    rng = np.random.default_rng(0)
+    across = rng.uniform(-0.7, 0.7, (COUNT, 2)) * HALF[1:]
+    return np.column_stack([np.full(COUNT, HALF[0]), across]).astype(np.float32)
+
+
+def seen_from(field, points_world, position_world):
+    """The share of returns that are compared, for a sensor at a position without a turn."""
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, 3] = position_world
+    cloud = points_world - pose[:3, 3]
+    return float(np.mean(compared(field, cloud, pose, 0.0).comparable))
+
+
+@pytest.mark.parametrize("way_m", [-0.02, 0.0, 0.02, 0.06])
+def test_a_wall_that_was_seen_from_inside_holds_no_returns_from_outside(sharp_map, way_m):
+    field = field_of(sharp_map)
+    ends = on_wall() + np.float32([way_m, 0, 0])
+    assert seen_from(field, ends, [0, 0, 0]) > 0.8
+    assert seen_from(field, ends, [HALF[0] + 2, 0, 0]) < 0.02
+
+
+def test_a_sheet_whose_sides_are_free_holds_returns_from_both():
+    rng = np.random.default_rng(0)
+    sheet = np.full((COUNT, 3), 0.03, np.float32)  # not on faces of voxels
+    sheet[:, 1:] = rng.uniform(-0.5, 0.5, (COUNT, 2))
+    state = hio.init(SHEET_CONFIG, jax.random.key(0))
+    sides = np.float32([[0.9, 0, 0], [-0.9, 0, 0]])
+    for number in range(6):
+        pose = np.eye(4, dtype=np.float32)
+        pose[:3, 3] = sides[number % 2]
+        state = hio.update(state, sheet - pose[:3, 3], pose)
+    for side in sides:
+        for way_m in (-0.01, 0.0, 0.01):
+            ends = np.float32([1, 0.8, 0.8]) * sheet + np.float32([way_m, 0, 0])
+            assert seen_from(field_of(state), ends, side) > 0.8

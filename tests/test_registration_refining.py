@@ -345,6 +345,9 @@ UNIT = np.eye(6)
         ({"prior": (np.eye(4), UNIT + np.eye(6, k=1))}, "prior covariance is not symmetric"),
         ({"prior": (np.eye(4), np.full((6, 6), np.inf))}, "prior covariance has values"),
         ({"noise": (0.0, 1.0)}, "noise a"),
+        ({"starts": 0}, "starts is 0, expected a whole number >= 1"),
+        ({"starts": 6}, "starts is 6, expected at most 5"),
+        ({"starts": 2.0}, "starts is 2.0, expected a whole number"),
     ],
 )
 def test_wrong_input_is_named(room, change, message):
@@ -383,7 +386,7 @@ def test_vmap_over_poses_and_a_scan_of_single_clouds_trace(sharp_map):
 
 @pytest.mark.parametrize(
     "step_m, steps, rests",
-    [(0.003, 24, False), (0.0015, 24, True), (8e-6, 24, True), (4e-6, 8, True)],
+    [(0.003, 24, False), (0.0015, 24, True), (8e-6, 24, True), (4e-6, 7, True)],
 )
 def test_a_pose_rests_by_the_length_of_its_whole_steps(monkeypatch, step_m, steps, rests):
     """Late steps are halved. That must not make a pose that still moves look as if it rested."""

@@ -79,9 +79,8 @@ class Tracker:
     ) -> np.ndarray:
         """Registers a frame that the map is not given; returns the pose (4, 4)."""
         predicted = self.predict(given)
-        return self._add(
-            frame, given, predicted, refine_pose(state, cloud, predicted, reach_m=GROWING_REACH_M)
-        )
+        found = refine_pose(state, cloud, predicted, reach_m=GROWING_REACH_M, starts=1)
+        return self._add(frame, given, predicted, found)
 
     def counts(self) -> dict[str, int]:
         """How many frames fit the map, and how many did not, by the keys of `metrics.json`."""

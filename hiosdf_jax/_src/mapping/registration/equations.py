@@ -183,7 +183,7 @@ def compare(
     """
     offset = offsets_from(pose, rows.points)
     points_world = offset + pose[:3, 3]
-    match = match_points(field, points_world, rows.some, rows.growing)
+    match = match_points(field, points_world, offset, rows.some, rows.growing)
     # Only the part of the error along the normal counts.
     square = jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-6)
     along = jnp.minimum(jnp.sum(match.normal * offset, axis=-1) ** 2 / square, 1)
@@ -215,12 +215,14 @@ def slope_of(residuals: Residuals) -> jax.Array:
     return jnp.sum(weighted[:, None] * residuals.jacobian, axis=0)
 
 
-def sum_in_cells(values: jax.Array, points_world: jax.Array, cell_m: float) -> jax.Array:
-    """Sums values (N, K) over the points (N, 3), m, of each cell of space; (CELLS, K)."""
+def sum_in_cells(
+    values: jax.Array, points_world: jax.Array, cell_m: float, cells: int = _CELLS
+) -> jax.Array:
+    """Sums values (N, K) over the points (N, 3), m, of each cell of space; (cells, K)."""
     cell = jnp.floor(points_world / cell_m).astype(jnp.int32).astype(jnp.uint32)
     # Large odd numbers spread the cells over the sums. Few share one by chance.
     row = cell[:, 0] * 73856093 ^ cell[:, 1] * 19349663 ^ cell[:, 2] * 83492791
-    return jax.ops.segment_sum(values, (row % _CELLS).astype(jnp.int32), _CELLS)
+    return jax.ops.segment_sum(values, (row % cells).astype(jnp.int32), cells)
 
 
 def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Directions:
@@ -262,6 +264,15 @@ def _loss(residuals: Residuals) -> jax.Array:
     """The loss of Geman and McClure, (N,), from 0 to 1."""
     square = (residuals.distance / (INLIER_DEVIATIONS * residuals.sigma)) ** 2
     return square / (1 + square)
+
+
+def mean_loss(residuals: Residuals) -> jax.Array:
+    """Returns the mean loss, (): 1 for returns where the map has seen no surface; inf for none."""
+    loss = jnp.where(residuals.comparable, _loss(residuals), 0)
+    contrary = residuals.contrary & ~residuals.comparable
+    count = jnp.sum(residuals.comparable | contrary)
+    mean = (jnp.sum(loss) + jnp.sum(contrary)) / jnp.maximum(count, 1)
+    return jnp.where(count > 0, mean, jnp.inf)
 
 
 def no_free_directions() -> Directions:

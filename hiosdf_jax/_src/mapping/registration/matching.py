@@ -35,6 +35,9 @@ _WIDE_VOXELS = 0.22
 _FREE_VOXELS = 0.5
 _EMPTY_VOXELS = 1.5
 
+# A surface faces away from the sensor if one voxel before it the ray is this deep in the solid.
+_BACK_VOXELS = 0.5
+
 # This many points of each ray are looked up. The last one is the first distance before the return.
 # A point is in a solid if it is the second distance behind a surface. One voxel nearer to the
 # sensor the signed distance is larger, by less than the third, unless the ray comes from behind.
@@ -68,7 +71,11 @@ class Match(NamedTuple):
 
 
 def match_points(
-    field: Field | Baked, points_world: jax.Array, some: jax.Array, growing: jax.Array | float
+    field: Field | Baked,
+    points_world: jax.Array,
+    offset: jax.Array,
+    some: jax.Array,
+    growing: jax.Array | float,
 ) -> Match:
     """Compares points with a map.
 
@@ -77,6 +84,7 @@ def match_points(
     Args:
         field: The map.
         points_world: (N, 3) m, finite.
+        offset: The same relative to the sensor, (N, 3) m.
         some: The row is a point, (N,) bool.
         growing: How incomplete the map is, () from 0 to 1.
 
@@ -112,11 +120,29 @@ def match_points(
         strict = share * growing
         inside &= beside < between(_MOST_BESIDE_VOXELS, strict)
         inside &= width > between(_LEAST_WIDTH_VOXELS, strict)
-        distance = share * distance + (1 - share) * plane.height
-        normal = share * normal + (1 - share) * plane.normal
+        # A sheet's distance grows on both sides, the height above its plane on one.
+        side = jnp.where(jnp.sum(normal * plane.normal, axis=-1) < 0, -1, 1)
+        distance = share * distance + (1 - share) * side * plane.height
+        normal = share * normal + (1 - share) * side[:, None] * plane.normal
         spread = share * spread + (1 - share) * plane.spread
+        inside &= ~_is_back(field, points_world, offset, normal)
     steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
     return Match(distance, normal, spread, depth, inside & steep, empty)
+
+
+def _is_back(
+    field: Field, points_world: jax.Array, offset: jax.Array, normal: jax.Array
+) -> jax.Array:
+    """Returns a mask of points whose nearest surface faces away from the sensor, (N,) bool.
+
+    A wall that was seen from the next room alone would hold the returns from its other side. Sheets
+    whose two sides are free have a front for every sensor.
+    """
+    size = field.config.voxel_size
+    away = jnp.sum(offset**2, axis=-1, keepdims=True)
+    before = points_world - size * offset * jax.lax.rsqrt(jnp.maximum(away, 1e-6))
+    behind = _voxel_sdf(field, before) < -_BACK_VOXELS * size
+    return behind & (jnp.sum(normal * offset, axis=-1) > 0)
 
 
 def find_blocked(

@@ -21,6 +21,7 @@ from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import (
+    MOST_STARTS,
     differentiable,
     select_rows,
     solve_coarse,
@@ -34,6 +35,7 @@ from hiosdf_jax._src.numerics.intake import (
     as_traced,
     check_covariance,
     check_pose,
+    check_whole,
     cloud_and_returns,
     is_traced,
 )
@@ -76,12 +78,14 @@ def refine_pose(
     *,
     noise: tuple[Any, Any] | None = None,
     reach_m: Any = _COMPLETE_REACH_M,
+    starts: int = MOST_STARTS,
 ) -> Registration:
     """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
 
     Gauss-Newton steps on the distances, with weights that outliers lose. The pose may be 15 cm
-    and 6 degrees off. Pure: works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field,
-    the cloud and the prior; see docs/poses.md.
+    and 6 degrees off. Where the cloud does not fit in the end, the steps begin again nearby. Pure:
+    works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field, the cloud and the prior;
+    see docs/poses.md.
 
     Args:
         field: A map, a snapshot of one, or a baked field.
@@ -95,6 +99,9 @@ def refine_pose(
         reach_m: How far surfaces may be from where they should be, m. The default suits a map that
             is complete. In one that grows, a wrong surface may be nearer than one that is missing:
             `track` takes 0.2. With a smaller reach outliers also lose their weight sooner.
+        starts: Poses to begin from, at most, 1 to 5: the given one, and others 15 cm and 6 degrees
+            away as long as the cloud does not fit. Take 1 to compare many poses under `vmap`, which
+            computes all of them for each.
 
     Returns:
         The refined pose, and how far it can be trusted.
@@ -102,7 +109,7 @@ def refine_pose(
     Raises:
         ValueError: A type or shape is wrong. Outside jit also: the pose or the prior's mean is not
             finite or not rigid, the prior's covariance is not symmetric and positive definite, the
-            cloud has no finite row, or a value of `noise` is out of range.
+            cloud has no finite row, or a value of `noise`, `reach_m` or `starts` is out of range.
 
     Example:
         >>> found = hio.refine_pose(field, cloud, odometry_pose)
@@ -113,14 +120,16 @@ def refine_pose(
     prior = _checked_prior(prior)
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
+    check_whole("starts", starts, 1, MOST_STARTS)
+    most = np.asarray(starts, np.int32)
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
-        return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach)
+        return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
     floats, _ = cloud_and_returns(cloud)
     # Padded to a multiple of one size, so that clouds of a stream share their compilation.
     rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
     padded = np.full((rows, 3), np.nan, np.float32)
     padded[: len(floats)] = floats
-    return _refine_jit(field, padded, check_pose(pose), prior, checked_noise, reach)
+    return _refine_jit(field, padded, check_pose(pose), prior, checked_noise, reach, most)
 
 
 @plain
@@ -131,6 +140,7 @@ def _refine(
     prior: tuple[jax.Array, jax.Array] | None,
     noise: jax.Array | None,
     reach_m: jax.Array,
+    starts: jax.Array | np.ndarray,
 ) -> Registration:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     if cloud.shape[0] == 0:
@@ -150,7 +160,7 @@ def _refine(
         anchor = Anchor(mean, jnp.linalg.inv(per_unit[:, None] * covariance * per_unit))
 
     still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
-    near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held, reach_m)
+    near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held, reach_m, starts)
     index, directions = select_rows(still, frozen, near)
     chosen = take_rows(frozen, index)
     found, residuals, rests, inflation = solve_fine(still, chosen, near, directions, held)

@@ -150,9 +150,9 @@ def relocalize(
     points, some = _draw(cloud)
     poses = _find_places(field, points, some, key, *ups, hypotheses)
     if traced:
-        refined = jax.lax.map(lambda pose: refine_pose(field, cloud, pose), poses)
+        refined = jax.lax.map(lambda pose: refine_pose(field, cloud, pose, starts=1), poses)
     else:  # one compilation, that of every other call
-        each = [refine_pose(field, cloud, pose) for pose in poses]
+        each = [refine_pose(field, cloud, pose, starts=1) for pose in poses]
         refined = jax.tree.map(lambda *parts: jnp.stack(parts), *each)
     return _choose(field, points, some, refined)
 

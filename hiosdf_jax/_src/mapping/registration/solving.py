@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.mapping.registration.equations import (
     Anchor,
@@ -18,6 +20,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     find_directions,
     find_step,
     information_of,
+    mean_loss,
     no_free_directions,
     slope_of,
     take_evenly,
@@ -29,9 +32,23 @@ from hiosdf_jax._src.state import Baked, Field
 
 # Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
 # suffice along directions in which few returns tell anything.
-_COARSE_END_M = 0.03
+_COARSE_END_M = 0.02
 _COARSE_STEPS = 24
 _DAMPING = 1e-5
+
+# Where the returns have more than this mean loss after the coarse steps, they may have come to a
+# wrong minimum. Most right poses of held-out frames have 0.016 to 0.02, wrong ones 0.04 to 0.2.
+_MOST_LOSS = 0.03
+
+# Then the steps begin again, this far from the given pose, m and rad, in directions to the corners
+# of tetrahedra. Of 210 poses in the apartment, 15 cm and 6 degrees off, one start loses 7, and five
+# lose none.
+_OTHER_WAY_M = 0.15
+_OTHER_ANGLE_RAD = 0.105
+_CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+_OTHER_STARTS = np.concatenate(
+    [_OTHER_WAY_M * _CORNERS, _OTHER_ANGLE_RAD * np.roll(-_CORNERS, 1, axis=0)], axis=1
+).astype(np.float32)
 
 # This many returns count as one independent return. Against a prior, coarse steps must not trust
 # them more: noisy normals seem to constrain directions that the surfaces do not constrain.
@@ -41,7 +58,7 @@ _COARSE_INFLATION = 16.0
 # yet right must be among them. Fine steps begin with a smaller tolerance, m, and shrink it by a
 # factor in each step.
 _SELECTED_M = 0.1
-_FINE_START_M = 0.06
+_FINE_START_M = 0.04
 _FINE_SHRINK = 0.7
 _FINE_END_M = 0.004  # no tolerance below
 
@@ -55,8 +72,17 @@ _FINISHED_M = 5e-6
 _RESTING_M = 2e-3
 
 
+MOST_STARTS = 1 + len(_OTHER_STARTS)
+"""Poses from which coarse steps can begin."""
+
+
 def solve_coarse(
-    field: Field | Baked, rows: Rows, pose: jax.Array, anchor: Anchor, reach_m: jax.Array | float
+    field: Field | Baked,
+    rows: Rows,
+    pose: jax.Array,
+    anchor: Anchor,
+    reach_m: jax.Array | float,
+    starts: jax.Array | np.ndarray | int = 1,
 ) -> jax.Array:
     """Brings a pose near the solution, with a tolerance that shrinks from step to step.
 
@@ -66,22 +92,37 @@ def solve_coarse(
         pose: (4, 4), where to begin.
         anchor: What holds free directions.
         reach_m: How far surfaces may be from where they should be in the first step.
+        starts: Poses to begin from, at most. Others around the given one are tried as long as the
+            returns do not fit.
 
     Returns:
-        (4, 4).
+        (4, 4), that with the least mean loss.
     """
     few = take_evenly(rows)
     shrink = _COARSE_END_M / reach_m
     # Fine steps bring free directions back.
     axes = no_free_directions()
+    motions = jnp.concatenate([jnp.zeros((1, 6), jnp.float32), _OTHER_STARTS])
 
-    def step(i: jax.Array, pose: jax.Array) -> jax.Array:
+    def step(i: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        pose, _ = carry
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         residuals = compare(field, few, pose, scale_m)
         motion = find_step(residuals, axes, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
-        return move(pose, motion)
+        return move(pose, motion), mean_loss(residuals)
 
-    return jax.lax.fori_loop(0, _COARSE_STEPS, step, pose)
+    def begin(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
+        best, least, number = carry
+        start = move(pose, motions[number]), jnp.float32(jnp.inf)
+        found, loss = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
+        better = (loss < least) | (number == 0)
+        return jnp.where(better, found, best), jnp.where(better, loss, least), number + 1
+
+    def continues(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, least, number = carry
+        return (number < starts) & ~(least <= _MOST_LOSS)
+
+    return jax.lax.while_loop(continues, begin, (pose, jnp.float32(jnp.inf), jnp.int32(0)))[0]
 
 
 def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.Array, Directions]:

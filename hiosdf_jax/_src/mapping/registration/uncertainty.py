@@ -1,8 +1,10 @@
 """How far a refined pose may be off.
 
 Returns are not independent: those on one piece of surface share the error of the map there. The
-returns of one cell of space therefore count as one observation. The spread of the sums over cells
-is measured, not assumed (the cluster-robust estimator of Liang and Zeger, Biometrika 1986).
+returns of one cell of space therefore count as one observation. How much the sums over cells vary
+is measured, not assumed (the cluster-robust estimator of Liang and Zeger, Biometrika 1986). For the
+covariance the cells are large, and the pose is solved without each of them in turn (the jackknife
+estimator of Bell and McCaffrey, Survey Methodology 2002).
 """
 
 from __future__ import annotations
@@ -21,8 +23,16 @@ from hiosdf_jax._src.mapping.registration.equations import (
     turn,
     units,
 )
+from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
 _CELL_M = 0.5
+
+# Cells that are left out in turn, m, and sums to which they are spread. Errors of a map reach this
+# far. For 200 poses in the simulated apartment the mean normalized square is 5.8, and 6 is right;
+# with cells of 0.5 m it is 7.1, and with cells of 1.2 m 5.7.
+_LEFT_OUT_M = 1.0
+_LEFT_OUT_CELLS = 256
+_LEAST_LEFT = 1e-3  # share of a direction's information that always stays
 
 _FREE_M = 100.0  # standard deviation of a free direction without a prior
 
@@ -61,12 +71,31 @@ def covariance_of(
         (6, 6) m and rad. A free direction without a prior has a standard deviation of 100 m.
     """
     free = jnp.diag(directions.free.astype(jnp.float32))
-    inverse = invert(turn(information_of(residuals), directions) + free) - free
+    independent = invert(turn(information_of(residuals), directions) + free) - free
     # At least that of independent returns: a few cells may agree by chance.
-    own = inverse @ turn(spread_of_slope(residuals), directions) @ inverse + inverse
-    own += _FREE_M**2 * free
+    own = _jackknife(residuals, directions) + independent + _FREE_M**2 * free
     if anchor.information is not None:
         prior = directions.basis.T @ anchor.information @ directions.basis
         own = invert(invert(own) + prior)
     size = directions.basis / units(rows)[:, None]
     return size @ own @ size.T
+
+
+def _jackknife(residuals: Residuals, directions: Directions) -> jax.Array:
+    """Sums the squares of the motions that leaving out each cell in turn would cause, (6, 6)."""
+    jacobian = jnp.matmul(residuals.jacobian, directions.basis, precision="highest")
+    jacobian = jnp.where(directions.free, 0, jacobian)
+    weighted = residuals.weight[:, None] * jacobian
+    squares = (weighted[:, :, None] * jacobian[:, None, :]).reshape(-1, 36)
+    parts = [weighted * residuals.distance[:, None], squares, residuals.weight[:, None]]
+    sums = sum_in_cells(
+        jnp.concatenate(parts, axis=-1), residuals.points_world, _LEFT_OUT_M, _LEFT_OUT_CELLS
+    )
+    slope, information = sums[:, :6], sums[:, 6:42].reshape(-1, 6, 6)
+    rest = jnp.sum(information, axis=0) - information
+    size = jax.lax.rsqrt(jnp.maximum(jnp.diag(jnp.sum(information, axis=0)), 1e-12))
+    rest = size[:, None] * rest * size + jnp.diag(_LEAST_LEFT + directions.free)
+    motion = size * solve_positive(rest, size * slope)
+    count = jnp.sum(sums[:, 42] > 0).astype(jnp.float32)
+    share = (count - 1) / jnp.maximum(count, 1)
+    return jnp.maximum(share, 0) * jnp.matmul(motion.T, motion, precision="highest")
