@@ -72,14 +72,25 @@ def test_other_starts_are_15_cm_and_6_degrees_away_in_all_directions():
         np.testing.assert_allclose(vectors.sum(axis=0), 0, atol=1e-7)
 
 
-def test_a_mean_loss_counts_returns_in_free_space_as_lost():
-    one = jnp.ones(4)
-    on_surface = jnp.array([True, True, False, False])
-    in_free_space = jnp.array([False, True, True, False])
-    zeros = jnp.zeros((4, 6))
-    residuals = equations.Residuals(
-        jnp.zeros(4), zeros, one, on_surface, in_free_space, one, zeros[:, :3]
-    )
-    assert float(equations.mean_loss(residuals)) == pytest.approx(1 / 3)
-    nothing = residuals._replace(comparable=jnp.zeros(4, bool), contrary=jnp.zeros(4, bool))
-    assert float(equations.mean_loss(nothing)) == np.inf
+def fit(on_surface, in_free_space, distance=0.0):
+    flags = [jnp.asarray(each, bool) for each in (on_surface, in_free_space)]
+    count = len(on_surface)
+    one, zeros = jnp.ones(count), jnp.zeros((count, 6))
+    residuals = equations.Residuals(distance * one, zeros, one, *flags, one, zeros[:, :3])
+    return equations.fit_of(residuals, jnp.ones(count, bool))
+
+
+def test_returns_in_free_space_are_lost_and_unknown_ones_cost_a_tenth():
+    found = fit([1, 1, 0, 0], [0, 1, 1, 0])
+    assert float(found.loss) == pytest.approx(1 / 3)
+    assert float(found.of_all) == pytest.approx((1 + 0.1) / 4)
+    nothing = fit([0, 0], [0, 0])
+    assert float(nothing.loss) == np.inf
+    assert float(nothing.of_all) == pytest.approx(0.1)
+
+
+def test_a_pose_is_no_better_because_fewer_returns_can_be_compared():
+    all_known = fit([1] * 10, [0] * 10, 0.6)  # loss 0.04
+    few_known = fit([1] * 2 + [0] * 8, [0] * 10, 0.3)  # loss 0.01
+    assert float(few_known.loss) < float(all_known.loss)
+    assert float(few_known.of_all) > float(all_known.of_all)

@@ -49,6 +49,9 @@ _LEAST_GROWTH_BAKED = 0.01
 # This many of the least determined directions are tried: a plane leaves three free.
 _TRIED_DIRECTIONS = 3
 
+# Loss of a return about which the map tells nothing, where poses are compared.
+_UNKNOWN_LOSS = 0.1
+
 # Information of a free direction without a prior: a standard deviation of 100 m.
 _FREE_INFORMATION = 1e-4
 
@@ -266,13 +269,27 @@ def _loss(residuals: Residuals) -> jax.Array:
     return square / (1 + square)
 
 
-def mean_loss(residuals: Residuals) -> jax.Array:
-    """Returns the mean loss, (): 1 for returns where the map has seen no surface; inf for none."""
+class Fit(NamedTuple):
+    """How badly returns fit.
+
+    Attributes:
+        loss: Mean loss of the returns about which the map tells something, (); inf for none.
+        of_all: The same for all returns, (). A pose must not seem better because fewer returns can
+            be compared there.
+    """
+
+    loss: jax.Array
+    of_all: jax.Array
+
+
+def fit_of(residuals: Residuals, some: jax.Array) -> Fit:
+    """Computes how badly returns fit; those where the map has seen no surface are lost."""
     loss = jnp.where(residuals.comparable, _loss(residuals), 0)
     contrary = residuals.contrary & ~residuals.comparable
-    count = jnp.sum(residuals.comparable | contrary)
-    mean = (jnp.sum(loss) + jnp.sum(contrary)) / jnp.maximum(count, 1)
-    return jnp.where(count > 0, mean, jnp.inf)
+    total = jnp.sum(loss) + jnp.sum(contrary)
+    known, count = jnp.sum(residuals.comparable | contrary), jnp.sum(some)
+    mean = jnp.where(known > 0, total / jnp.maximum(known, 1), jnp.inf)
+    return Fit(mean, (total + _UNKNOWN_LOSS * (count - known)) / jnp.maximum(count, 1))
 
 
 def no_free_directions() -> Directions:

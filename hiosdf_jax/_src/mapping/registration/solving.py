@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,14 +14,15 @@ import numpy as np
 from hiosdf_jax._src.mapping.registration.equations import (
     Anchor,
     Directions,
+    Fit,
     Residuals,
     Rows,
     balance,
     compare,
     find_directions,
     find_step,
+    fit_of,
     information_of,
-    mean_loss,
     no_free_directions,
     slope_of,
     take_evenly,
@@ -96,33 +98,34 @@ def solve_coarse(
             returns do not fit.
 
     Returns:
-        (4, 4), that with the least mean loss.
+        (4, 4), that where the returns fit best.
     """
     few = take_evenly(rows)
     shrink = _COARSE_END_M / reach_m
     # Fine steps bring free directions back.
     axes = no_free_directions()
     motions = jnp.concatenate([jnp.zeros((1, 6), jnp.float32), _OTHER_STARTS])
+    unknown = Fit(jnp.float32(jnp.inf), jnp.float32(jnp.inf))
 
-    def step(i: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def step(i: jax.Array, carry: tuple[jax.Array, Fit]) -> tuple[jax.Array, Fit]:
         pose, _ = carry
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         residuals = compare(field, few, pose, scale_m)
         motion = find_step(residuals, axes, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
-        return move(pose, motion), mean_loss(residuals)
+        return move(pose, motion), fit_of(residuals, few.some)
 
-    def begin(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
+    def begin(carry: tuple[jax.Array, Fit, jax.Array]) -> tuple[jax.Array, Fit, jax.Array]:
         best, least, number = carry
-        start = move(pose, motions[number]), jnp.float32(jnp.inf)
-        found, loss = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
-        better = (loss < least) | (number == 0)
-        return jnp.where(better, found, best), jnp.where(better, loss, least), number + 1
+        found = jax.lax.fori_loop(0, _COARSE_STEPS, step, (move(pose, motions[number]), unknown))
+        better = (found[1].of_all < least.of_all) | (number == 0)
+        pick = partial(jnp.where, better)
+        return *jax.tree.map(pick, found, (best, least)), number + 1
 
-    def continues(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+    def continues(carry: tuple[jax.Array, Fit, jax.Array]) -> jax.Array:
         _, least, number = carry
-        return (number < starts) & ~(least <= _MOST_LOSS)
+        return (number < starts) & ~(least.loss <= _MOST_LOSS)
 
-    return jax.lax.while_loop(continues, begin, (pose, jnp.float32(jnp.inf), jnp.int32(0)))[0]
+    return jax.lax.while_loop(continues, begin, (pose, unknown, jnp.int32(0)))[0]
 
 
 def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.Array, Directions]:
