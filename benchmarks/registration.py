@@ -87,6 +87,8 @@ def main():
     parser.add_argument("--tries", type=int, default=10, help="perturbations per frame")
     parser.add_argument("--between", type=int, default=0, help="poses between the demo's frames")
     arguments = parser.parse_args()
+    if arguments.between and arguments.stream:
+        parser.error("--between is for the demo, without --stream")
     stream = demo.ApartmentStream(80)
     if arguments.stream:
         stream = datasets.open_stream(arguments.stream)

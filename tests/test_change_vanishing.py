@@ -249,14 +249,16 @@ def test_only_changed_voxels_that_the_cloud_looked_at_are_counted():
     window = patch()
     for _ in range(2):
         before = window
-        window, _ = scan(window, through(ALL))
-    assert int(vanishing.count_changed(before, window)) == 1
+        window, traced = scan(window, through(ALL))
+    # The patch was the only surface, and the wall behind it has the other voxels.
+    surface = float(np.sum(window.hits > 0))
+    assert float(vanishing.share_of_changes(before, traced, window)) == pytest.approx(1 / surface)
     # The mark stays where no ray passes, but is no news there.
-    elsewhere, _ = scan(window, through(ASIDE))
+    elsewhere, traced = scan(window, through(ASIDE))
     assert int(elsewhere.change[CELL]) == int(window.change[CELL])
-    assert int(vanishing.count_changed(window, elsewhere)) == 0
-    again, _ = scan(elsewhere, through(ALL))
-    assert int(vanishing.count_changed(elsewhere, again)) == 1
+    assert float(vanishing.share_of_changes(window, traced, elsewhere)) == 0
+    again, traced = scan(elsewhere, through(ALL))
+    assert float(vanishing.share_of_changes(elsewhere, traced, again)) > 0
 
 
 def test_rays_that_are_not_in_range_change_nothing():

@@ -8,7 +8,17 @@ import pytest
 from room import stream
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.stages import CHECKS, FUSION, STAGES, begin, is_accepted, refuse
+from hiosdf_jax._src.change import vanishing
+from hiosdf_jax._src.mapping.stages import (
+    CHECKS,
+    FUSION,
+    STAGES,
+    begin,
+    is_accepted,
+    refuse,
+    run_stages,
+)
+from hiosdf_jax._src.network import training
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 
 
@@ -84,3 +94,31 @@ def test_update_is_the_stages_one_by_one(program, empty_map, frame):
     _, noise = check_extras(None, noise)
     expected = jax.make_jaxpr(by_hand)(empty_map, cloud, pose, noise, np.uint32(0))
     assert text(program) == text(expected)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_weights_are_averaged_by_the_change_that_the_cloud_saw(
+    monkeypatch, empty_map, frame, share
+):
+    """Marks of changes elsewhere in the map say nothing: they stay until rays pass them."""
+    seen = []
+
+    def schedule(config, updates, changed):
+        seen.append(changed)
+        return jnp.int32(0), jnp.float32(0)
+
+    monkeypatch.setattr(training, "schedule", schedule)
+    monkeypatch.setattr(vanishing, "share_of_changes", lambda *_: jnp.float32(share))
+    evidence = empty_map.grid.evidence
+    marked = jnp.full_like(evidence.change, -72)
+    grid = empty_map.grid.replace(evidence=evidence.replace(change=marked))
+    state = empty_map.replace(grid=grid)
+
+    def changed(state, cloud, pose):
+        seen.clear()
+        finite = jnp.ones(len(cloud), bool)
+        run_stages(begin(state, cloud, finite, pose), STAGES)
+        return seen[0]
+
+    cloud, pose = frame[:2]
+    assert float(jax.jit(changed)(state, cloud, pose)) == pytest.approx(share)

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from room import room_cloud
 
-from hiosdf_jax._src.mapping.registration import equations, solving
+import hiosdf_jax as hio
+from hiosdf_jax._src.mapping.registration import equations, refining, solving
 
 ROWS = equations.make_rows(jnp.ones((8, 3)), jnp.ones(8, bool), (0.01, 0.001))
 
@@ -80,17 +82,82 @@ def fit(on_surface, in_free_space, distance=0.0):
     return equations.fit_of(residuals, jnp.ones(count, bool))
 
 
-def test_returns_in_free_space_are_lost_and_unknown_ones_cost_a_tenth():
+def test_returns_in_free_space_are_lost():
     found = fit([1, 1, 0, 0], [0, 1, 1, 0])
     assert float(found.loss) == pytest.approx(1 / 3)
-    assert float(found.of_all) == pytest.approx((1 + 0.1) / 4)
-    nothing = fit([0, 0], [0, 0])
-    assert float(nothing.loss) == np.inf
-    assert float(nothing.of_all) == pytest.approx(0.1)
+    assert float(found.known) == pytest.approx(3 / 4)
+    assert float(fit([0, 0], [0, 0]).loss) == np.inf
+    assert float(fit([1] + [0] * 19, [0] * 20).loss) == np.inf  # too few
 
 
-def test_a_pose_is_no_better_because_fewer_returns_can_be_compared():
-    all_known = fit([1] * 10, [0] * 10, 0.6)  # loss 0.04
-    few_known = fit([1] * 2 + [0] * 8, [0] * 10, 0.3)  # loss 0.01
-    assert float(few_known.loss) < float(all_known.loss)
-    assert float(few_known.of_all) > float(all_known.of_all)
+@pytest.mark.parametrize("outliers", [2, 8, 15])
+def test_a_pose_is_no_better_because_fewer_returns_can_be_compared(outliers):
+    right = fit([1] * (100 - outliers) + [0] * outliers, [0] * (100 - outliers) + [1] * outliers)
+    elsewhere = fit([1] * 20 + [0] * 80, [0] * 100)
+    assert float(elsewhere.loss) < float(right.loss)
+    assert not bool(equations.fits_better(elsewhere, right))
+    assert bool(equations.fits_better(right, elsewhere))
+
+
+def test_a_right_pose_is_better_although_more_of_its_returns_are_unknown():
+    right = fit([1] * 60 + [0] * 40, [0] * 100, 0.36)  # loss 0.014
+    wrong = fit([1] * 90 + [0] * 10, [0] * 100, 1.3)  # loss 0.16
+    assert bool(equations.fits_better(right, wrong))
+    nothing = fit([0] * 100, [0] * 100)
+    assert bool(equations.fits_better(wrong, nothing))
+    assert not bool(equations.fits_better(nothing, wrong))
+    assert not bool(equations.fits_better(nothing, nothing))
+
+
+def test_starts_that_end_far_away_or_nowhere_are_not_kept(monkeypatch, begun):
+    far = np.eye(4, dtype=np.float32)
+    far[0, 3] = 0.5
+    for wrong in (far, np.full((4, 4), np.nan, np.float32)):
+        moves = solving.move
+
+        def move(pose, motion, wrong=wrong, moves=moves):
+            return jnp.where(jnp.any(motion != 0), wrong, moves(pose, motion))
+
+        with monkeypatch.context() as patch:
+            patch.setattr(solving, "move", move)
+            pose = search(patch, [0.5, 0.0, 0.0, 0.0, 0.0], 5)
+        np.testing.assert_array_equal(pose, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("call", "expected"),
+    [
+        (lambda *given: hio.refine_pose(*given), 5),
+        (lambda *given: hio.refine_pose(*given, starts=2), 2),
+        (lambda *given: hio.refine_pose(*given, prior=(np.eye(4), np.eye(6))), 1),
+        (lambda *given: hio.track(*given), 1),
+    ],
+)
+def test_starts_that_each_function_asks_for(monkeypatch, empty_map, call, expected):
+    asked = []
+
+    def note(field, rows, pose, anchor, reach_m, starts):
+        asked.append(int(starts))
+        return pose
+
+    monkeypatch.setattr(refining, "solve_coarse", note)
+    cloud, pose = room_cloud(0)
+    jax.eval_shape(lambda cloud: call(empty_map, cloud, pose), jnp.asarray(cloud))
+    assert asked == [expected]
+
+
+def test_places_are_found_from_one_start_each_and_are_differentiable(monkeypatch, empty_map):
+    asked = []
+
+    def note(field, rows, pose, anchor, reach_m, starts):
+        asked.append(int(starts))
+        return pose
+
+    def height(cloud, state):
+        return hio.relocalize(state, cloud, jax.random.key(0), hypotheses=256).best.pose[2, 3]
+
+    monkeypatch.setattr(refining, "solve_coarse", note)
+    cloud, _ = room_cloud(0)
+    slope = jax.eval_shape(jax.grad(height), jnp.asarray(cloud), empty_map)
+    assert slope.shape == cloud.shape
+    assert set(asked) == {1}

@@ -7,6 +7,7 @@ import pytest
 from hiosdf_jax._src.mapping.registration import equations, uncertainty
 
 COUNT = 600
+CELL_M = 1.0  # for a sensor that sees 2.5 m and farther
 
 
 def residuals_of(seed, free=0):
@@ -14,9 +15,9 @@ def residuals_of(seed, free=0):
     rng = np.random.default_rng(seed)
     jacobian = rng.normal(size=(COUNT, 6))
     weight = 1e4 * rng.uniform(0.5, 2, COUNT)
-    points = rng.uniform(0, 2 * uncertainty._LEFT_OUT_M, (COUNT, 3))
+    points = rng.uniform(0, 2 * CELL_M, (COUNT, 3))
     # One error per cell, and some of each return's own.
-    cell = np.floor(points / uncertainty._LEFT_OUT_M).astype(int)
+    cell = np.floor(points / CELL_M).astype(int)
     shared = rng.normal(size=(2, 2, 2))[tuple(cell.T)]
     distance = 0.05 * (shared + 0.3 * rng.normal(size=COUNT))
     bound = jacobian[:, free:]
@@ -31,7 +32,8 @@ def residuals_of(seed, free=0):
 
 
 def rows():
-    return equations.make_rows(jnp.ones((4, 3)), jnp.ones(4, bool), (0.01, 0.0))
+    points = jnp.array([[3.0, 0, 0]])
+    return equations.make_rows(points, jnp.ones(1, bool), (0.01, 0.0))
 
 
 def covariance(residuals, free=0):
@@ -53,7 +55,7 @@ def jackknife(residuals, free=0):
             residuals.points_world,
         )
     )
-    _, cell = np.unique(np.floor(points / uncertainty._LEFT_OUT_M), axis=0, return_inverse=True)
+    _, cell = np.unique(np.floor(points / CELL_M), axis=0, return_inverse=True)
     root = np.sqrt(weight)
     motions = []
     for left_out in range(cell.max() + 1):
@@ -86,6 +88,23 @@ def test_a_free_direction_has_a_deviation_of_100_m_and_no_part_in_the_others():
     np.testing.assert_allclose(found[:2, 2:], 0, atol=1e-6)
     scale = np.sqrt(np.diag(expected))
     assert (np.abs(found[2:, 2:] - expected) / scale[:, None] / scale).max() < 5e-3
+
+
+def test_cells_shrink_with_a_small_scene():
+    """A scene half as large, with errors half as large, has a quarter of the variance."""
+    large = residuals_of(7)
+    small = large._replace(
+        distance=large.distance / 2, weight=4 * large.weight, points_world=large.points_world / 2
+    )
+    half = equations.make_rows(jnp.array([[1.25, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
+    full = equations.make_rows(jnp.array([[2.5, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
+    directions, anchor = equations.no_free_directions(), equations.Anchor(jnp.eye(4), None)
+    found = [
+        np.asarray(uncertainty.covariance_of(part, directions, anchor, made))
+        * np.outer(equations.units(made), equations.units(made))
+        for part, made in ((large, full), (small, half))
+    ]
+    np.testing.assert_allclose(found[1], found[0] / 4, rtol=1e-3, atol=1e-9)
 
 
 def test_a_single_cell_tells_no_more_than_independent_returns():

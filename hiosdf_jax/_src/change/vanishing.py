@@ -159,21 +159,25 @@ def is_recent(change: jax.Array) -> jax.Array:
     return (change > 0) | (change < _FORGOTTEN)
 
 
-def count_changed(before: EvidenceWindow, window: EvidenceWindow) -> jax.Array:
-    """Counts the voxels that a cloud looked at where a surface has just appeared or vanished.
+def share_of_changes(
+    before: EvidenceWindow, traced: EvidenceWindow, window: EvidenceWindow
+) -> jax.Array:
+    """Computes how much of the surface a cloud has seen appear or vanish.
 
-    Voxels that no ray has met since they changed are not counted: they keep their mark until then,
-    and would look like a change for ever.
+    Voxels that this cloud did not look at are not counted: they keep their mark until rays pass
+    them, and would look like a change for ever.
 
     Args:
         before: The evidence before the cloud.
-        window: The evidence with the cloud's hits and passes.
+        traced: The evidence with the cloud's hits and passes.
+        window: The same after surfaces have appeared and vanished.
 
     Returns:
-        Their number, () int32.
+        Such voxels, as a share of the voxels with a surface in the window, () float32.
     """
-    looked_at = (window.hits > before.hits) | (window.passes > jnp.abs(before.passes))
-    return jnp.sum(is_recent(window.change) & looked_at, dtype=jnp.int32)
+    looked_at = (traced.hits > before.hits) | (traced.passes > jnp.abs(before.passes))
+    changed = jnp.sum(is_recent(window.change) & looked_at)
+    return changed / jnp.maximum(jnp.sum(window.hits > 0), 1).astype(jnp.float32)
 
 
 def _look(

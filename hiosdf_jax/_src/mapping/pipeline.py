@@ -20,6 +20,7 @@ from hiosdf_jax._src.mapping.stages import (
     refuse,
     run_stages,
 )
+from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
     as_traced,
     check_pose,
@@ -128,7 +129,8 @@ def run_update(
         The new map.
     """
     compiled = _update_donating if donate else _update_jit
-    return compiled(state, cloud, pose, *extras, flags_so_far)
+    with collector_paused():
+        return compiled(state, cloud, pose, *extras, flags_so_far)
 
 
 def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:

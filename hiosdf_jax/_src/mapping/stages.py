@@ -62,7 +62,7 @@ class Step(NamedTuple):
         novelty: The cloud compared with the map before it.
         before: The evidence around the sensor before this cloud, float32.
         window: The same with this cloud.
-        changed: Voxels that the cloud saw change, () int32.
+        changed: Share of the surface that the cloud saw appear or vanish, ().
         samples: Training samples.
         losses: Mean losses of the last epoch.
         trained: Whether training was finite, () bool.
@@ -183,7 +183,7 @@ def renew_evidence(step: Step) -> Step:
     window = vanishing.drop_vanished(config, before, window, placed, view, step.state.updates)
     if step.robot is not None:
         window = robot.clear_robot(config, window, *step.robot)
-    changed = vanishing.count_changed(before, window)
+    changed = vanishing.share_of_changes(before, held(step.window), window)
     return step._replace(window=_with_patches(window, step.window), changed=changed)
 
 
@@ -229,9 +229,7 @@ def sample_cloud(step: Step) -> Step:
 
 def train(step: Step) -> Step:
     """Fits the network to the samples (IV-D)."""
-    surface = jnp.sum(held(step.state.grid.evidence).hits > 0)
-    changed = step.changed / jnp.maximum(surface, 1)
-    extra_epochs, average = training.schedule(step.config, step.state.updates, changed)
+    extra_epochs, average = training.schedule(step.config, step.state.updates, step.changed)
     network, losses, trained = training.train(
         step.config, held(step.state.network), step.samples, extra_epochs, average, step.keys.order
     )

@@ -55,8 +55,7 @@ def schedule(config: Config, updates: jax.Array, changed: jax.Array) -> tuple[ja
     Args:
         config: The map's configuration.
         updates: Number of earlier updates, () int32.
-        changed: Number of voxels where a surface has just appeared or vanished, as a share of all
-            voxels with a surface, ().
+        changed: Share of the surface that the newest cloud saw appear or vanish, ().
 
     Returns:
         extra_epochs: Epochs beyond `least_epochs`, () int32.

@@ -49,8 +49,12 @@ _LEAST_GROWTH_BAKED = 0.01
 # This many of the least determined directions are tried: a plane leaves three free.
 _TRIED_DIRECTIONS = 3
 
-# Loss of a return about which the map tells nothing, where poses are compared.
-_UNKNOWN_LOSS = 0.1
+LEAST_COMPARABLE = 0.1
+"""Share of the returns that must lie where the map has observed."""
+
+# What a return about which the map tells nothing has more than the mean loss of the worse of two
+# poses. Without it, clouds with 15 % of outliers are moved to where the map ends.
+_UNKNOWN_MORE = 0.1
 
 # Information of a free direction without a prior: a standard deviation of 100 m.
 _FREE_INFORMATION = 1e-4
@@ -219,7 +223,7 @@ def slope_of(residuals: Residuals) -> jax.Array:
 
 
 def sum_in_cells(
-    values: jax.Array, points_world: jax.Array, cell_m: float, cells: int = _CELLS
+    values: jax.Array, points_world: jax.Array, cell_m: jax.Array | float, cells: int = _CELLS
 ) -> jax.Array:
     """Sums values (N, K) over the points (N, 3), m, of each cell of space; (cells, K)."""
     cell = jnp.floor(points_world / cell_m).astype(jnp.int32).astype(jnp.uint32)
@@ -273,23 +277,35 @@ class Fit(NamedTuple):
     """How badly returns fit.
 
     Attributes:
-        loss: Mean loss of the returns about which the map tells something, (); inf for none.
-        of_all: The same for all returns, (). A pose must not seem better because fewer returns can
-            be compared there.
+        loss: Mean loss of the returns about which the map tells something, () from 0 to 1; inf if
+            they are too few. A return in space that was seen empty has loss 1.
+        known: Their share of all returns, ().
     """
 
     loss: jax.Array
-    of_all: jax.Array
+    known: jax.Array
 
 
 def fit_of(residuals: Residuals, some: jax.Array) -> Fit:
-    """Computes how badly returns fit; those where the map has seen no surface are lost."""
+    """Computes how badly returns (N,) fit."""
     loss = jnp.where(residuals.comparable, _loss(residuals), 0)
     contrary = residuals.contrary & ~residuals.comparable
     total = jnp.sum(loss) + jnp.sum(contrary)
     known, count = jnp.sum(residuals.comparable | contrary), jnp.sum(some)
-    mean = jnp.where(known > 0, total / jnp.maximum(known, 1), jnp.inf)
-    return Fit(mean, (total + _UNKNOWN_LOSS * (count - known)) / jnp.maximum(count, 1))
+    enough = known >= jnp.maximum(LEAST_COMPARABLE * count, 1)
+    mean = jnp.where(enough, total / jnp.maximum(known, 1), jnp.inf)
+    return Fit(mean, known / jnp.maximum(count, 1).astype(jnp.float32))
+
+
+def fits_better(one: Fit, other: Fit) -> jax.Array:
+    """Returns whether a cloud fits better in one pose than in another, () bool.
+
+    A return about which the map tells nothing counts more than a known one in the worse pose. So no
+    pose is better because fewer returns can be compared there.
+    """
+    unknown = jnp.maximum(one.loss, other.loss) + _UNKNOWN_MORE
+    first, second = (fit.known * fit.loss + (1 - fit.known) * unknown for fit in (one, other))
+    return jnp.where(jnp.isfinite(unknown), first < second, one.loss < other.loss)
 
 
 def no_free_directions() -> Directions:

@@ -14,14 +14,13 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.mapping.registration.equations import (
     INLIER_DEVIATIONS,
+    LEAST_COMPARABLE,
     Rows,
     compare,
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
 from hiosdf_jax._src.state import Baked, Field
-
-_LEAST_COMPARABLE = 0.1  # share of the returns that must lie where the map has observed
 
 LEAST_INLIERS = 0.7
 """Share of the returns in observed space that must lie on its surfaces."""
@@ -79,7 +78,7 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
     supporting = variety * inliers + _ALLOWANCE * total
 
     share = inliers.astype(jnp.float32) / jnp.maximum(jnp.sum(judged), 1).astype(jnp.float32)
-    fits = comparable >= jnp.maximum(_LEAST_COMPARABLE * total, 1)
+    fits = comparable >= jnp.maximum(LEAST_COMPARABLE * total, 1)
     fits &= share >= LEAST_INLIERS
     fits &= supporting >= _LEAST_SHARE * (supporting + contrary)
     return Verdict(jnp.sqrt(square), share, fits)

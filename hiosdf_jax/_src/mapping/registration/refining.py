@@ -21,6 +21,7 @@ from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly
 from hiosdf_jax._src.mapping.registration.solving import (
+    COMPLETE_REACH_M,
     MOST_STARTS,
     differentiable,
     select_rows,
@@ -29,6 +30,7 @@ from hiosdf_jax._src.mapping.registration.solving import (
 )
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
 from hiosdf_jax._src.numerics.arrays import scalar
+from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
     as_floats,
     as_number,
@@ -45,8 +47,6 @@ from hiosdf_jax._src.state import Baked, Field
 
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384
-
-_COMPLETE_REACH_M = 0.7  # how far surfaces may be from where they should be, in a complete map
 
 
 class Registration(NamedTuple):
@@ -77,7 +77,7 @@ def refine_pose(
     prior: tuple[Any, Any] | None = None,
     *,
     noise: tuple[Any, Any] | None = None,
-    reach_m: Any = _COMPLETE_REACH_M,
+    reach_m: Any = COMPLETE_REACH_M,
     starts: int = MOST_STARTS,
 ) -> Registration:
     """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
@@ -99,9 +99,9 @@ def refine_pose(
         reach_m: How far surfaces may be from where they should be, m. The default suits a map that
             is complete. In one that grows, a wrong surface may be nearer than one that is missing:
             `track` takes 0.2. With a smaller reach outliers also lose their weight sooner.
-        starts: Poses to begin from, at most, 1 to 5: the given one, and others 15 cm and 6 degrees
-            away as long as the cloud does not fit. Take 1 to compare many poses under `vmap`, which
-            computes all of them for each.
+        starts: Most poses to begin from, 1 to 5, not traced: the given one, and others 15 cm and 6
+            degrees away as long as the cloud does not fit. With a prior, only the given one. Take 1
+            to compare many poses: under `vmap` each takes as many starts as the worst one.
 
     Returns:
         The refined pose, and how far it can be trusted.
@@ -121,7 +121,7 @@ def refine_pose(
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
     check_whole("starts", starts, 1, MOST_STARTS)
-    most = np.asarray(starts, np.int32)
+    most = np.asarray(1 if prior is not None else starts, np.int32)
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
     floats, _ = cloud_and_returns(cloud)
@@ -129,7 +129,9 @@ def refine_pose(
     rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
     padded = np.full((rows, 3), np.nan, np.float32)
     padded[: len(floats)] = floats
-    return _refine_jit(field, padded, check_pose(pose), prior, checked_noise, reach, most)
+    checked = check_pose(pose)
+    with collector_paused():
+        return _refine_jit(field, padded, checked, prior, checked_noise, reach, most)
 
 
 @plain
@@ -151,7 +153,7 @@ def _refine(
     points, some = draw_evenly(cloud, _CANDIDATES)
     floor, growth = noise_of(field) if noise is None else noise
     range_noise = jnp.float32(floor), jnp.float32(growth)
-    growing = (_COMPLETE_REACH_M - reach_m) / (_COMPLETE_REACH_M - GROWING_REACH_M)
+    growing = (COMPLETE_REACH_M - reach_m) / (COMPLETE_REACH_M - GROWING_REACH_M)
     rows = make_rows(points, some, range_noise, jnp.clip(growing, 0, 1))
     anchor = Anchor(pose, None)
     if prior is not None:

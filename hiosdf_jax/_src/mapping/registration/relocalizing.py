@@ -201,7 +201,8 @@ def _find_places(
     fewer = take_evenly(rows, _KEPT_ROWS)
 
     def improve(start: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pose = solve_coarse(field, fewer, start, Anchor(start, None), _REACH_M)
+        still, frozen, begin = jax.lax.stop_gradient((field, fewer, start))
+        pose = solve_coarse(still, frozen, begin, Anchor(begin, None), _REACH_M)
         pose = jnp.where(jnp.all(jnp.isfinite(pose)), pose, start)
         return pose, _score(field, rows, pose)
 

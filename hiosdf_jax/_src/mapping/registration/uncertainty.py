@@ -27,11 +27,13 @@ from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
 _CELL_M = 0.5
 
-# Cells that are left out in turn, m, and sums to which they are spread. Errors of a map reach this
-# far. For 200 poses in the simulated apartment the mean normalized square is 5.8, and 6 is right;
-# with cells of 0.5 m it is 7.1, and with cells of 1.2 m 5.7.
-_LEFT_OUT_M = 1.0
-_LEFT_OUT_CELLS = 256
+# Size of the cells that are left out in turn: a share of the typical range, and its limits, m.
+# Errors of a map reach about this far. For 200 poses in the simulated apartment the mean normalized
+# square is 5.6, and 6 is right; with cells of 0.5 m it was 7.1, and with cells of 1.2 m 5.4. Cells
+# are spread to this many sums; those that share one are left out together.
+_LEFT_OUT_SHARE = 0.4
+_LEFT_OUT_M = (0.2, 1.0)
+_LEFT_OUT_SUMS = 1024
 _LEAST_LEFT = 1e-3  # share of a direction's information that always stays
 
 _FREE_M = 100.0  # standard deviation of a free direction without a prior
@@ -73,7 +75,7 @@ def covariance_of(
     free = jnp.diag(directions.free.astype(jnp.float32))
     independent = invert(turn(information_of(residuals), directions) + free) - free
     # At least that of independent returns: a few cells may agree by chance.
-    own = _jackknife(residuals, directions) + independent + _FREE_M**2 * free
+    own = _jackknife(residuals, directions, rows) + independent + _FREE_M**2 * free
     if anchor.information is not None:
         prior = directions.basis.T @ anchor.information @ directions.basis
         own = invert(invert(own) + prior)
@@ -81,15 +83,16 @@ def covariance_of(
     return size @ own @ size.T
 
 
-def _jackknife(residuals: Residuals, directions: Directions) -> jax.Array:
+def _jackknife(residuals: Residuals, directions: Directions, rows: Rows) -> jax.Array:
     """Sums the squares of the motions that leaving out each cell in turn would cause, (6, 6)."""
+    cell_m = jnp.clip(_LEFT_OUT_SHARE * rows.length, *_LEFT_OUT_M)
     jacobian = jnp.matmul(residuals.jacobian, directions.basis, precision="highest")
     jacobian = jnp.where(directions.free, 0, jacobian)
     weighted = residuals.weight[:, None] * jacobian
     squares = (weighted[:, :, None] * jacobian[:, None, :]).reshape(-1, 36)
     parts = [weighted * residuals.distance[:, None], squares, residuals.weight[:, None]]
     sums = sum_in_cells(
-        jnp.concatenate(parts, axis=-1), residuals.points_world, _LEFT_OUT_M, _LEFT_OUT_CELLS
+        jnp.concatenate(parts, axis=-1), residuals.points_world, cell_m, _LEFT_OUT_SUMS
     )
     slope, information = sums[:, :6], sums[:, 6:42].reshape(-1, 6, 6)
     rest = jnp.sum(information, axis=0) - information

@@ -1,0 +1,28 @@
+"""Python's garbage collector, which takes half of the time in which JAX traces a large function."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def collector_paused() -> Iterator[None]:
+    """Pauses the garbage collector around a call that may trace and compile.
+
+    Other threads of the process are not collected meanwhile, either. A collector that was off stays
+    off.
+
+    Example:
+        >>> with collector_paused():
+        ...     return compiled(state, cloud, pose)
+    """
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
