@@ -147,7 +147,7 @@ def test_a_young_map_refuses_nothing(room_map):
 
 
 def test_after_many_refusals_the_next_cloud_is_fused(sharp_map):
-    """The sensor may have been carried elsewhere; the map must not stay wrong for ever."""
+    """The sensor may have been carried elsewhere; the map must not stay wrong forever."""
     state = sharp_map
     for k in range(CONFIG.most_refusals):
         state = hio.update(state, *contradiction(k))

@@ -29,13 +29,14 @@ def begun(monkeypatch):
     return lambda: [numbers[i] for i in range(0, len(numbers), solving._COARSE_STEPS)]
 
 
-def search(monkeypatch, losses, starts):
+def search(monkeypatch, losses, starts, reach_m=0.7):
     """Searches where the mean loss at the given pose and at each other start is as given."""
     other = jnp.asarray(solving._OTHER_STARTS[:, :3])
 
     def compare(_, rows, pose, scale_m):
         way = jnp.linalg.norm(pose[:3, 3] - other, axis=1)
-        number = jnp.where(jnp.min(way) < 1e-5, jnp.argmin(way) + 1, 0)
+        number = jnp.where(jnp.min(way) < 1e-5, jnp.argmin(way) + 1, -1)  # elsewhere the last one
+        number = jnp.where(jnp.linalg.norm(pose[:3, 3]) < 1e-5, 0, number)
         loss = jnp.asarray(losses, jnp.float32)[number]
         ratio = jnp.sqrt(loss / (1 - loss)) * equations.INLIER_DEVIATIONS
         one, flag = jnp.ones(8), jnp.ones(8, bool)
@@ -44,7 +45,7 @@ def search(monkeypatch, losses, starts):
 
     monkeypatch.setattr(solving, "compare", compare)
     anchor = equations.Anchor(jnp.eye(4), None)
-    pose = solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, 0.7, starts)
+    pose = solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, reach_m, starts)
     jax.effects_barrier()
     return np.asarray(pose)
 
@@ -109,6 +110,37 @@ def test_a_right_pose_is_better_although_more_of_its_returns_are_unknown():
     assert not bool(equations.fits_better(nothing, nothing))
 
 
+def test_few_returns_that_fit_are_not_enough_to_stop(monkeypatch, begun):
+    """A quarter of the returns fits, and the map tells nothing about the others."""
+
+    def compare(_, rows, pose, scale_m):
+        zero, flag = jnp.zeros(8) + 0 * scale_m + 0 * pose[0, 3], jnp.arange(8) < 2
+        world = jnp.zeros((8, 3))
+        return equations.Residuals(
+            zero, jnp.zeros((8, 6)), zero + 1, flag, ~flag & flag, zero, world
+        )
+
+    monkeypatch.setattr(solving, "compare", compare)
+    anchor = equations.Anchor(jnp.eye(4), None)
+    solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, 0.7, 3)
+    jax.effects_barrier()
+    assert begun() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("reach_m", [0.7, 0.2])
+def test_starts_are_nearer_with_a_smaller_reach(monkeypatch, reach_m):
+    poses = []
+
+    def stay(residuals, axes, anchor, rows, pose, *_):
+        jax.debug.callback(lambda pose: poses.append(np.asarray(pose)), pose)
+        return jnp.zeros(6)
+
+    monkeypatch.setattr(solving, "find_step", stay)
+    search(monkeypatch, [0.5, 0.5, 0.5, 0.5, 0.5], 5, reach_m)
+    ways = [np.linalg.norm(pose[:3, 3]) for pose in poses[:: solving._COARSE_STEPS]]
+    np.testing.assert_allclose(ways, [0] + 4 * [0.15 * reach_m / 0.7], atol=1e-6)
+
+
 def test_starts_that_end_far_away_or_nowhere_are_not_kept(monkeypatch, begun):
     far = np.eye(4, dtype=np.float32)
     far[0, 3] = 0.5
@@ -122,6 +154,16 @@ def test_starts_that_end_far_away_or_nowhere_are_not_kept(monkeypatch, begun):
             patch.setattr(solving, "move", move)
             pose = search(patch, [0.5, 0.0, 0.0, 0.0, 0.0], 5)
         np.testing.assert_array_equal(pose, np.eye(4))
+
+
+def test_a_start_that_ends_nowhere_gives_way_to_others(monkeypatch):
+    def lose(residuals, axes, anchor, rows, pose, *_):
+        lost = jnp.linalg.norm(pose[:3, 3]) < 1e-5
+        return jnp.where(lost, jnp.nan, jnp.zeros(6))
+
+    monkeypatch.setattr(solving, "find_step", lose)
+    pose = search(monkeypatch, [0.5, 0.4, 0.6, 0.7, 0.2], 5)
+    np.testing.assert_allclose(pose[:3, 3], solving._OTHER_STARTS[3, :3], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,8 @@ def share_of_changes(
     """Computes how much of the surface a cloud has seen appear or vanish.
 
     Voxels that this cloud did not look at are not counted: they keep their mark until rays pass
-    them, and would look like a change for ever.
+    them, and would look like a change forever. Remains that go without a ray of their own are not
+    counted, either.
 
     Args:
         before: The evidence before the cloud.
@@ -173,7 +174,7 @@ def share_of_changes(
         window: The same after surfaces have appeared and vanished.
 
     Returns:
-        Such voxels, as a share of the voxels with a surface in the window, () float32.
+        Such voxels, per voxel with a surface in the window, () float32.
     """
     looked_at = (traced.hits > before.hits) | (traced.passes > jnp.abs(before.passes))
     changed = jnp.sum(is_recent(window.change) & looked_at)

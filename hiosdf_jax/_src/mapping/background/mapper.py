@@ -333,7 +333,7 @@ class BackgroundMapper:
 
 
 def _timeout(timeout_s: Any) -> float | None:
-    """Checks how long to wait, s; None is for ever, and so is more than threads can count."""
+    """Checks how long to wait, s; None is forever, and so is more than threads can count."""
     if timeout_s is None:
         return None
     return min(_seconds("timeout_s", timeout_s), threading.TIMEOUT_MAX)

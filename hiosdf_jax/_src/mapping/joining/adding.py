@@ -74,7 +74,7 @@ def _count_passes(
     """Counts the rays of each map that passed the patches of the sum.
 
     Beside surfaces, a voxel of the sum overlaps unseen voxels of a moved map and has none of its
-    passes. Stray hits of the other maps would stay there for ever.
+    passes. Stray hits of the other maps would stay there forever.
     """
     counts = [
         jnp.abs(window.passes) if its_move is None else its_move.passes_at(total.mean)

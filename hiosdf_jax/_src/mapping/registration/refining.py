@@ -100,16 +100,18 @@ def refine_pose(
             is complete. In one that grows, a wrong surface may be nearer than one that is missing:
             `track` takes 0.2. With a smaller reach outliers also lose their weight sooner.
         starts: Most poses to begin from, 1 to 5, not traced: the given one, and others 15 cm and 6
-            degrees away as long as the cloud does not fit. With a prior, only the given one. Take 1
-            to compare many poses: under `vmap` each takes as many starts as the worst one.
+            degrees away as long as the cloud does not fit; nearer ones with a smaller reach. With a
+            prior, only the given one. Take 1 to compare many poses: under `vmap` each takes as many
+            starts as the worst one.
 
     Returns:
         The refined pose, and how far it can be trusted.
 
     Raises:
-        ValueError: A type or shape is wrong. Outside jit also: the pose or the prior's mean is not
-            finite or not rigid, the prior's covariance is not symmetric and positive definite, the
-            cloud has no finite row, or a value of `noise`, `reach_m` or `starts` is out of range.
+        ValueError: A type or shape is wrong, or `starts` is no whole number from 1 to 5. Outside
+            jit also: the pose or the prior's mean is not finite or not rigid, the prior's
+            covariance is not symmetric and positive definite, the cloud has no finite row, or a
+            value of `noise` or `reach_m` is out of range.
 
     Example:
         >>> found = hio.refine_pose(field, cloud, odometry_pose)

@@ -42,6 +42,7 @@ _DAMPING = 1e-5
 # Where the returns have more than this mean loss after the coarse steps, they may have come to a
 # wrong minimum. Most right poses of held-out frames have 0.016 to 0.02, wrong ones 0.04 to 0.2.
 _MOST_LOSS = 0.03
+_LEAST_KNOWN = 0.3  # share of the returns about which the map must tell something
 
 # Then the steps begin again, this far from the given pose, m and rad, in directions to the corners
 # of tetrahedra. Of 210 poses in the apartment, 15 cm and 6 degrees off, one start loses 7, and five
@@ -125,7 +126,8 @@ def solve_coarse(
         start = move(pose, motions[number]), unknown
         found, fit = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
         way, angle = way_and_angle(pose, found)
-        near = (way <= _FARTHEST * _OTHER_WAY_M) & (angle <= _FARTHEST * _OTHER_ANGLE_RAD)
+        most = _FARTHEST * size
+        near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
         usable = jnp.all(jnp.isfinite(found)) & ((number == 0) | near)
         fit = fit._replace(loss=jnp.where(usable, fit.loss, jnp.inf))
         better = (number == 0) | fits_better(fit, least)
@@ -134,7 +136,8 @@ def solve_coarse(
 
     def continues(carry: tuple[jax.Array, Fit, jax.Array]) -> jax.Array:
         _, least, number = carry
-        return (number < starts) & ~(least.loss <= _MOST_LOSS)
+        fits = (least.loss <= _MOST_LOSS) & (least.known >= _LEAST_KNOWN)
+        return (number < starts) & ~fits
 
     return jax.lax.while_loop(continues, begin, (pose, unknown, jnp.int32(0)))[0]
 
