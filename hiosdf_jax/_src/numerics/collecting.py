@@ -1,4 +1,4 @@
-"""Python's garbage collector, which takes half of the time in which JAX traces a large function."""
+"""Pauses Python's garbage collector, which JAX's tracing of a large function calls many times."""
 
 from __future__ import annotations
 
