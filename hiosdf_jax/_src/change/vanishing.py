@@ -84,8 +84,7 @@ def drop_vanished(
     Returns:
         The window; vanished voxels are free.
     """
-    hit = window.hits > before.hits
-    passed = window.passes > jnp.abs(before.passes)
+    hit, passed = _met(before, window)
     change = jnp.where(hit, jnp.maximum(window.change, 0), window.change)
     forgetting = passed & (change < _FORGOTTEN)
     later = jnp.where(change == _FORGOTTEN - 1, 0, change + 1)
@@ -176,9 +175,14 @@ def share_of_changes(
     Returns:
         Such voxels, per voxel with a surface in the window, () float32.
     """
-    looked_at = (traced.hits > before.hits) | (traced.passes > jnp.abs(before.passes))
-    changed = jnp.sum(is_recent(window.change) & looked_at)
+    hit, passed = _met(before, traced)
+    changed = jnp.sum(is_recent(window.change) & (hit | passed))
     return changed / jnp.maximum(jnp.sum(window.hits > 0), 1).astype(jnp.float32)
+
+
+def _met(before: EvidenceWindow, window: EvidenceWindow) -> tuple[jax.Array, jax.Array]:
+    """Returns masks of the voxels in which rays of the cloud ended, and which they passed."""
+    return window.hits > before.hits, window.passes > jnp.abs(before.passes)
 
 
 def _look(

@@ -89,7 +89,7 @@ def track(
         padded, pose = check_and_pad(cloud, predicted_pose, state.config.max_points)
         fused_cloud, start = jax.device_put((padded, pose))
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
-    found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m, starts=1)
+    found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
     found, flags_so_far = _register_jit(state.updates, start, found, own, reach)
     extras, donate = (None, checked_noise), donate and not traced

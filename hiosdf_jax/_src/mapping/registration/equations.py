@@ -379,18 +379,19 @@ def find_step(
     information += damping * jnp.trace(information) / 6 * jnp.eye(6, dtype=jnp.float32)
     matrix = stiffness(information, directions, anchor)
     wanted = balance(directions, slope_of(residuals) / inflation, anchor, rows, pose)
-    size = _sizes(matrix)
+    size = sizes(matrix)
     step = size * solve_positive(size[:, None] * matrix * size, size * wanted)
     return -jnp.matmul(directions.basis, step, precision="highest") / units(rows)
 
 
 def invert(matrix: jax.Array) -> jax.Array:
     """Inverts a positive definite matrix whose rows differ by many orders of magnitude."""
-    size = _sizes(matrix)
+    size = sizes(matrix)
     return size[:, None] * jnp.linalg.inv(size[:, None] * matrix * size) * size
 
 
-def _sizes(matrix: jax.Array) -> jax.Array:
+def sizes(matrix: jax.Array) -> jax.Array:
+    """Returns factors (6,) that scale rows and columns of a matrix to a unit diagonal."""
     return jax.lax.rsqrt(jnp.maximum(jnp.diag(matrix), 1e-12))
 
 

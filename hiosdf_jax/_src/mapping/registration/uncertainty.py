@@ -19,6 +19,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     Rows,
     information_of,
     invert,
+    sizes,
     sum_in_cells,
     turn,
     units,
@@ -95,9 +96,9 @@ def _jackknife(residuals: Residuals, directions: Directions, rows: Rows) -> jax.
         jnp.concatenate(parts, axis=-1), residuals.points_world, cell_m, _LEFT_OUT_SUMS
     )
     slope, information = sums[:, :6], sums[:, 6:42].reshape(-1, 6, 6)
-    rest = jnp.sum(information, axis=0) - information
-    size = jax.lax.rsqrt(jnp.maximum(jnp.diag(jnp.sum(information, axis=0)), 1e-12))
-    rest = size[:, None] * rest * size + jnp.diag(_LEAST_LEFT + directions.free)
+    whole = jnp.sum(information, axis=0)
+    size = sizes(whole)
+    rest = size[:, None] * (whole - information) * size + jnp.diag(_LEAST_LEFT + directions.free)
     motion = size * solve_positive(rest, size * slope)
     occupied = sums[:, 42] > 0
     count = jnp.maximum(jnp.sum(occupied), 1).astype(jnp.float32)
