@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hiosdf_jax._src.numerics.small_matrices import solve_positive
+from hiosdf_jax._src.numerics.small_matrices import product, solve_positive
 
 solve = jax.jit(solve_positive)
 
@@ -28,6 +28,14 @@ def test_solutions_are_those_of_numpy(size, condition):
     assert error.max() < 2e-6 * condition
     one = np.stack([solve(m, v) for m, v in zip(matrix[:5], value[:5], strict=True)])
     np.testing.assert_allclose(one, found[:5], rtol=1e-5 * condition, atol=1e-5)
+
+
+@pytest.mark.parametrize("shapes", [((3, 3), (3, 3)), ((6, 6), (6,)), ((5, 2, 4), (5, 4, 3))])
+def test_products_are_those_of_numpy_in_float64(shapes):
+    rng = np.random.default_rng(0)
+    first, second = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    expected = first.astype(float) @ second.astype(float)
+    np.testing.assert_allclose(product(first, second), expected, atol=2e-6)
 
 
 def test_a_direction_without_information_stays_finite():

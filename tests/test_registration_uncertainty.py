@@ -98,7 +98,8 @@ def test_cells_shrink_with_a_small_scene():
     )
     half = equations.make_rows(jnp.array([[1.25, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
     full = equations.make_rows(jnp.array([[2.5, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
-    directions, anchor = equations.no_free_directions(), equations.Anchor(jnp.eye(4), None)
+    directions = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
+    anchor = equations.Anchor(jnp.eye(4), None)
     found = [
         np.asarray(uncertainty.covariance_of(part, directions, anchor, made))
         * np.outer(equations.units(made), equations.units(made))

@@ -1,7 +1,7 @@
-"""Linear equations of a few unknowns, written out.
+"""Products and linear equations of small matrices, written out.
 
-On a GPU, a Gauss-Newton step takes 0.7 of the time with it: the solver of a library starts several
-kernels for one 6 x 6 matrix.
+XLA makes one kernel of them and what surrounds them. A library starts a kernel for each product,
+and several for one system of linear equations.
 """
 
 from __future__ import annotations
@@ -11,6 +11,21 @@ import jax.numpy as jnp
 
 # Pivots below this share of the diagonal are rounding errors of float32.
 _LEAST_PIVOT = 1e-5
+
+
+def product(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Multiplies matrices with exact float32 sums.
+
+    Args:
+        first: (..., M, K), K small.
+        second: (..., K, N), or a vector (K,).
+
+    Returns:
+        (..., M, N), or (..., M) for a vector.
+    """
+    if second.ndim == 1:
+        return jnp.sum(first * second, axis=-1)
+    return jnp.sum(first[..., :, :, None] * second[..., None, :, :], axis=-2)
 
 
 def solve_positive(matrix: jax.Array, value: jax.Array) -> jax.Array:

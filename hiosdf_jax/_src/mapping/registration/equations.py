@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.mapping.registration.matching import between, match_points
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move, offsets_from
 from hiosdf_jax._src.mapping.registration.selection import even_steps
-from hiosdf_jax._src.numerics.small_matrices import solve_positive
+from hiosdf_jax._src.numerics.small_matrices import product, solve_positive
 from hiosdf_jax._src.state import Baked, Field
 
 GROWING_REACH_M = 0.2
@@ -210,16 +210,30 @@ def compare(
     return Residuals(match.distance, jacobian, sigma, comparable, contrary, weight, points_world)
 
 
+def normal_equations(residuals: Residuals) -> tuple[jax.Array, jax.Array]:
+    """Computes the normal equations of independent returns.
+
+    Args:
+        residuals: The returns at a pose.
+
+    Returns:
+        The information matrix, (6, 6) 1/m^2, and the slope of half the weighted sum of squares by
+        the motion, (6,) 1/m.
+    """
+    weighted = residuals.weight[:, None] * residuals.jacobian
+    values = jnp.concatenate([residuals.jacobian, residuals.distance[:, None]], axis=-1)
+    sums = jnp.matmul(weighted.T, values, precision="highest")
+    return sums[:, :6], sums[:, 6]
+
+
 def information_of(residuals: Residuals) -> jax.Array:
     """Computes the information matrix of independent returns, (6, 6) 1/m^2."""
-    weighted = residuals.weight[:, None] * residuals.jacobian
-    return jnp.matmul(weighted.T, residuals.jacobian, precision="highest")
+    return normal_equations(residuals)[0]
 
 
 def slope_of(residuals: Residuals) -> jax.Array:
     """Computes the slope of half the weighted sum of squares by the motion, (6,) 1/m."""
-    weighted = residuals.weight * residuals.distance
-    return jnp.sum(weighted[:, None] * residuals.jacobian, axis=0)
+    return normal_equations(residuals)[1]
 
 
 def sum_in_cells(
@@ -308,31 +322,23 @@ def fits_better(one: Fit, other: Fit) -> jax.Array:
     return jnp.where(jnp.isfinite(unknown), first < second, one.loss < other.loss)
 
 
-def no_free_directions() -> Directions:
-    """Returns the axes, none of them free."""
-    return Directions(jnp.eye(6, dtype=jnp.float32), jnp.zeros(6, bool))
-
-
 def turn(matrix: jax.Array, directions: Directions) -> jax.Array:
     """Turns a matrix (6, 6) to the directions' basis, without what it has of free ones."""
-    inside = jnp.matmul(
-        directions.basis.T,
-        jnp.matmul(matrix, directions.basis, precision="highest"),
-        precision="highest",
-    )
+    inside = product(directions.basis.T, product(matrix, directions.basis))
     bound = ~directions.free
     return jnp.where(bound[:, None] & bound, inside, 0)
 
 
 def balance(
-    directions: Directions, slope: jax.Array, anchor: Anchor, rows: Rows, pose: jax.Array
+    directions: Directions | None, slope: jax.Array, anchor: Anchor, rows: Rows, pose: jax.Array
 ) -> jax.Array:
     """Computes what is zero at the solution: the slopes of returns and anchor.
 
     Returns do not constrain free directions. There the prior decides, or the initial pose.
 
     Args:
-        directions: The principal directions of the returns' information.
+        directions: The principal directions of the returns' information. None stands for the axes,
+            none of them free.
         slope: Slope of the returns' cost by the motion, (6,).
         anchor: What holds free directions.
         rows: The returns.
@@ -341,20 +347,27 @@ def balance(
     Returns:
         (6,), one component per direction.
     """
-    away = units(rows) * motion_between(anchor.pose, pose)
-    own = jnp.where(directions.free, 0, jnp.matmul(directions.basis.T, slope, precision="highest"))
-    return own + jnp.matmul(_pull(directions, anchor), away, precision="highest")
+    own = slope
+    if directions is not None:
+        own = jnp.where(directions.free, 0, product(directions.basis.T, slope))
+    pull = _pull(directions, anchor)
+    if pull is None:
+        return own
+    return own + product(pull, units(rows) * motion_between(anchor.pose, pose))
 
 
-def stiffness(information: jax.Array, directions: Directions, anchor: Anchor) -> jax.Array:
+def stiffness(information: jax.Array, directions: Directions | None, anchor: Anchor) -> jax.Array:
     """Computes the information of returns and anchor, (6, 6), in the directions' basis."""
-    pull = jnp.matmul(_pull(directions, anchor), directions.basis, precision="highest")
-    return turn(information, directions) + pull
+    own = information if directions is None else turn(information, directions)
+    pull = _pull(directions, anchor)
+    if pull is None:
+        return own
+    return own + (pull if directions is None else product(pull, directions.basis))
 
 
 def find_step(
     residuals: Residuals,
-    directions: Directions,
+    directions: Directions | None,
     anchor: Anchor,
     rows: Rows,
     pose: jax.Array,
@@ -375,13 +388,14 @@ def find_step(
     Returns:
         The motion, (6,) m and rad.
     """
-    information = information_of(residuals) / inflation
+    information, slope = (part / inflation for part in normal_equations(residuals))
     information += damping * jnp.trace(information) / 6 * jnp.eye(6, dtype=jnp.float32)
     matrix = stiffness(information, directions, anchor)
-    wanted = balance(directions, slope_of(residuals) / inflation, anchor, rows, pose)
-    size = sizes(matrix)
-    step = size * solve_positive(size[:, None] * matrix * size, size * wanted)
-    return -jnp.matmul(directions.basis, step, precision="highest") / units(rows)
+    wanted = balance(directions, slope, anchor, rows, pose)
+    step = solve_positive(matrix, wanted)
+    if directions is not None:
+        step = product(directions.basis, step)
+    return -step / units(rows)
 
 
 def invert(matrix: jax.Array) -> jax.Array:
@@ -395,8 +409,10 @@ def sizes(matrix: jax.Array) -> jax.Array:
     return jax.lax.rsqrt(jnp.maximum(jnp.diag(matrix), 1e-12))
 
 
-def _pull(directions: Directions, anchor: Anchor) -> jax.Array:
-    """The anchor's information, from motions to the directions' basis, (6, 6)."""
+def _pull(directions: Directions | None, anchor: Anchor) -> jax.Array | None:
+    """The anchor's information, from motions to the directions' basis, (6, 6); None without it."""
+    if directions is None:
+        return anchor.information
     if anchor.information is None:
         return jnp.where(directions.free, _FREE_INFORMATION, 0)[:, None] * directions.basis.T
-    return jnp.matmul(directions.basis.T, anchor.information, precision="highest")
+    return product(directions.basis.T, anchor.information)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.numerics.small_matrices import product
+
 # Below this angle, rad, series replace quotients of small numbers.
 _SMALL = 1e-3
 
@@ -22,8 +24,10 @@ def move(pose: jax.Array, motion: jax.Array) -> jax.Array:
     Returns:
         (4, 4).
     """
-    rotation = jnp.matmul(rotation_of(motion[3:]), pose[:3, :3], precision="highest")
-    return jnp.asarray(pose).at[:3, :3].set(rotation).at[:3, 3].add(motion[:3])
+    pose = jnp.asarray(pose)
+    rotation = product(rotation_of(motion[3:]), pose[:3, :3])
+    moved = jnp.concatenate([rotation, (pose[:3, 3] + motion[:3])[:, None]], axis=1)
+    return jnp.concatenate([moved, pose[3:]])
 
 
 def offsets_from(pose: jax.Array, points: jax.Array) -> jax.Array:
@@ -49,7 +53,7 @@ def motion_between(first: jax.Array, second: jax.Array) -> jax.Array:
     Returns:
         (6,) m and rad: `move(first, motion)` is `second`.
     """
-    turn = jnp.matmul(second[:3, :3], first[:3, :3].T, precision="highest")
+    turn = product(second[:3, :3], first[:3, :3].T)
     vector = vector_of(turn)
     return jnp.concatenate([second[:3, 3] - first[:3, 3], vector])
 
@@ -75,9 +79,9 @@ def rotation_of(vector: jax.Array) -> jax.Array:
     zero = jnp.zeros_like(x)
     across = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     return (
-        jnp.eye(3, dtype=jnp.float32)
+        (1 - second * square) * jnp.eye(3, dtype=jnp.float32)
         + first * across
-        + second * jnp.matmul(across, across, precision="highest")
+        + second * vector[:, None] * vector
     )
 
 

@@ -39,6 +39,7 @@ from hiosdf_jax._src.numerics.intake import (
     is_traced,
 )
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.small_matrices import product
 from hiosdf_jax._src.numerics.vectors import dot, each, split
 from hiosdf_jax._src.state import Baked, Field
 
@@ -193,7 +194,7 @@ def _find_places(
     level = _turn_onto(up_sensor / jnp.linalg.norm(up_sensor), up)
 
     def pose_of(at: _Upright) -> jax.Array:
-        turn = jnp.matmul(rotation_of(at.angle_rad * up), level, precision="highest")
+        turn = product(rotation_of(at.angle_rad * up), level)
         return jnp.eye(4, dtype=jnp.float32).at[:3, :3].set(turn).at[:3, 3].set(at.position_world)
 
     starts = _search(field, jnp.where(some[:, None], points, jnp.nan), key, pose_of, hypotheses)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.numerics.masks import count_below, running_sum
+from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
 # Share of the rows that are drawn evenly. The others are drawn by what they tell of the pose.
 _EVEN_SHARE = 0.2
@@ -56,8 +57,7 @@ def draw_informative(
     Returns:
         (count,) int32, ascending; rows of much leverage come more than once.
     """
-    solved = jnp.linalg.solve(information, jacobian.T).T
-    leverage = weight * jnp.sum(jacobian * solved, axis=-1)
+    leverage = weight * jnp.sum(jacobian * solve_positive(information, jacobian), axis=-1)
     possible = (weight > 0).astype(jnp.float32)
 
     def share(values: jax.Array) -> jax.Array:

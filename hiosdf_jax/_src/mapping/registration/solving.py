@@ -24,7 +24,6 @@ from hiosdf_jax._src.mapping.registration.equations import (
     fit_of,
     fits_better,
     information_of,
-    no_free_directions,
     slope_of,
     take_evenly,
 )
@@ -64,7 +63,7 @@ _COARSE_INFLATION = 16.0
 # factor in each step.
 _SELECTED_M = 0.1
 _FINE_START_M = 0.04
-_FINE_SHRINK = 0.7
+_FINE_SHRINK = 0.6
 _FINE_END_M = 0.004  # no tolerance below
 
 _FINE_STEPS = 24
@@ -73,7 +72,7 @@ _WHOLE_STEPS = 16  # half steps then: the distance has kinks, around which whole
 # When this was chosen, the median error on held-out frames of a house was 0.29 cm and 0.048
 # degrees; 0.31 and 0.059 with 2,048 rows, and 0.26 and 0.049 with 4,096.
 _FINE_ROWS = 3072
-_FINISHED_M = 5e-6
+_FINISHED_M = 5e-5
 _RESTING_M = 2e-3
 
 
@@ -108,23 +107,23 @@ def solve_coarse(
     """
     few = take_evenly(rows)
     shrink = _COARSE_END_M / reach_m
-    # Fine steps bring free directions back.
-    axes = no_free_directions()
     size = jnp.minimum(reach_m / COMPLETE_REACH_M, 1)
     motions = size * jnp.concatenate([jnp.zeros((1, 6), jnp.float32), _OTHER_STARTS])
     unknown = Fit(jnp.float32(jnp.inf), jnp.float32(0))
 
-    def step(i: jax.Array, carry: tuple[jax.Array, Fit]) -> tuple[jax.Array, Fit]:
+    def step(i: jax.Array, carry: tuple[jax.Array, Residuals]) -> tuple[jax.Array, Residuals]:
         pose, _ = carry
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         residuals = compare(field, few, pose, scale_m)
-        motion = find_step(residuals, axes, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
-        return move(pose, motion), fit_of(residuals, few.some)
+        # Fine steps bring free directions back.
+        motion = find_step(residuals, None, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
+        return move(pose, motion), residuals
 
     def begin(carry: tuple[jax.Array, Fit, jax.Array]) -> tuple[jax.Array, Fit, jax.Array]:
         best, least, number = carry
-        start = move(pose, motions[number]), unknown
-        found, fit = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
+        start = move(pose, motions[number]), _no_residuals(field, few, pose)
+        found, residuals = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
+        fit = fit_of(residuals, few.some)
         way, angle = way_and_angle(pose, found)
         most = _FARTHEST * size
         near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
@@ -204,10 +203,8 @@ def solve_fine(
     Returns:
         The solution.
     """
-    blank = jax.eval_shape(compare, field, rows, pose, jnp.float32(0))
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank)
     one = jnp.ones((), jnp.float32)
-    solution = Solution(pose, blank, jnp.zeros((), bool), one)
+    solution = Solution(pose, _no_residuals(field, rows, pose), jnp.zeros((), bool), one)
     if anchor.information is None:
         return _rest(field, rows, solution, directions, anchor, _FINE_START_M)
 
@@ -219,6 +216,12 @@ def solve_fine(
         return _rest(field, rows, found, directions, anchor, start_m)
 
     return jax.lax.fori_loop(0, 2, solve, solution)
+
+
+def _no_residuals(field: Field | Baked, rows: Rows, pose: jax.Array) -> Residuals:
+    """Returns zeros in the shapes of residuals."""
+    shapes = jax.eval_shape(compare, field, rows, pose, jnp.float32(0))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def _rest(
