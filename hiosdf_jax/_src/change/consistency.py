@@ -14,7 +14,7 @@ from hiosdf_jax._src.change import directions
 from hiosdf_jax._src.change.piercing import find_piercing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.modes import cond
+from hiosdf_jax._src.numerics.modes import run_if
 from hiosdf_jax._src.state import Grid
 
 CONFIDENT_UPDATES = 5
@@ -103,15 +103,13 @@ def judge(
         wrong = in_free + through
         return (wrong > most * comparable) & (wrong > least * total)
 
-    def look(rays: Rays) -> tuple[jax.Array, jax.Array]:
+    def look(_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         every_ray = directions.smoothness(rays, rays.in_range)
         return every_ray, directions.smoothness(rays, compared.novel)
 
-    def skip(_: Rays) -> tuple[jax.Array, jax.Array]:
-        return jnp.float32(directions.UNKNOWN), jnp.float32(directions.UNKNOWN)
-
     suspicious = (updates >= CONFIDENT_UPDATES) & exceeds(_NOISE_WRONG, _LEAST_NOISE_WRONG)
-    smooth, smooth_novel = cond(suspicious, look, skip, rays)
+    unknown = jnp.float32(directions.UNKNOWN)
+    smooth, smooth_novel = run_if(suspicious, look, (unknown, unknown), rays, compared)
     noise = suspicious & (smooth != directions.UNKNOWN) & (smooth < _LEAST_SMOOTH)
     fills_view = (
         (smooth_novel >= _LEAST_SMOOTH)

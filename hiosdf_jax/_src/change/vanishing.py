@@ -16,7 +16,7 @@ from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.masks import first_true_indices
-from hiosdf_jax._src.numerics.modes import cond
+from hiosdf_jax._src.numerics.modes import run_if
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each, length, split, take, unit
 
@@ -133,7 +133,7 @@ def drop_vanished(
         return jax.lax.fori_loop(0, _SPREADS, once, vanished, unroll=rounds_per_step(_SPREADS))
 
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_IF_MET
-    vanished = cond(many, spread, lambda vanished: vanished, vanished)
+    vanished = run_if(many, spread, vanished, window)
     window = window._replace(change=put(change, counted))
     return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import AxisType, PartitionSpec
 
 
@@ -100,6 +101,29 @@ def cond(pred: jax.Array, true: Callable, false: Callable, *operands: Any) -> An
         return lambda *operands: varying_like(branch(*operands), pred, operands)
 
     return jax.lax.cond(pred, vary(true), vary(false), *operands)
+
+
+def run_if(pred: jax.Array, function: Callable[[Any], Any], value: Any, *others: Any) -> Any:
+    """Applies a function where it is needed, and under `jax.vmap` only if any element needs it.
+
+    There `jax.lax.cond` runs both branches for all elements. The result has no derivatives.
+
+    Args:
+        pred: Whether to apply it, () bool.
+        function: Maps `value` to values of the same types.
+        value: A pytree of arrays.
+        others: Pytrees of the other arrays that the function reads.
+
+    Returns:
+        The function's result where `pred` holds, else `value`.
+    """
+    done = varying_like(jnp.zeros((), bool), pred, value, others)
+    start = varying_like((pred, jax.lax.stop_gradient(value)), pred, value, others)
+
+    def body(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return done, jax.lax.stop_gradient(function(carry[1]))
+
+    return jax.lax.while_loop(lambda carry: carry[0], body, start)[1]
 
 
 def _varying_axes(leaf: jax.Array) -> frozenset[Any]:
