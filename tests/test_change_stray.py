@@ -70,6 +70,18 @@ def test_a_small_cloud_is_counted_the_same_by_pairs_and_by_table(monkeypatch, se
     assert np.mean(by_pairs != stray_by_a_loop(rays)) < 2e-3
 
 
+def test_pairs_are_counted_up_to_the_largest_small_cloud():
+    count = stray._MOST_BY_PAIRS
+    place = tuple(jnp.zeros(count, jnp.int32) for _ in range(3))
+    total, agreeing = jax.jit(stray._count_by_pairs)(jnp.ones(count, bool), place)
+    np.testing.assert_array_equal(total, np.full(count, count))
+    np.testing.assert_array_equal(agreeing, total)
+    apart = (*place[:2], 3 * jnp.arange(count, dtype=jnp.int32))
+    total, agreeing = jax.jit(stray._count_by_pairs)(jnp.ones(count, bool), apart)
+    np.testing.assert_array_equal(total, np.full(count, count))
+    np.testing.assert_array_equal(agreeing, np.ones(count))
+
+
 def test_outliers_of_a_dense_cloud_are_stray_and_thin_things_are_not():
     ranges = np.full(6000, 2.0)
     ranges[:30] = np.linspace(0.4, 1.4, 30)  # each on its own

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType, PartitionSpec
 
 from hiosdf_jax._src.numerics.modes import run_if
 
@@ -33,6 +34,32 @@ def test_under_vmap_it_runs_only_if_any_element_needs_it():
         np.testing.assert_array_equal(run(needed, values), (1 + needed[:, None]) * values)
         jax.effects_barrier()
         assert bool(made) == needed.any()
+
+
+def test_trees_of_other_types_in_a_scan():
+    def step(carry, needed):
+        flags, count = carry
+        carry = run_if(needed, lambda c: (~c[0], c[1] + 1), (flags, count), needed)
+        return carry, carry[1]
+
+    start = jnp.array([True, False]), jnp.int32(0)
+    (flags, count), counts = jax.lax.scan(step, start, jnp.array([True, False, True, True]))
+    np.testing.assert_array_equal(flags, [False, True])
+    assert count == 3 and count.dtype == jnp.int32
+    np.testing.assert_array_equal(counts, [1, 1, 2, 3])
+
+
+def test_what_it_reads_may_vary_less_than_its_value_in_shard_map():
+    mesh = jax.make_mesh((1,), ("maps",), axis_types=(AxisType.Auto,))
+    one, none = PartitionSpec("maps"), PartitionSpec()
+
+    def double(pred, value, factor):
+        return run_if(pred[0], lambda _: factor * jnp.ones(1), value, factor)
+
+    sharded = jax.shard_map(double, mesh=mesh, in_specs=(one, one, none), out_specs=one)
+    for needed in (True, False):
+        result = jax.jit(sharded)(jnp.array([needed]), jnp.zeros(1), jnp.float32(2))
+        np.testing.assert_array_equal(result, [2 * needed])
 
 
 def test_its_result_has_no_derivatives():

@@ -30,6 +30,13 @@ def test_solutions_are_those_of_numpy(size, condition):
     np.testing.assert_allclose(one, found[:5], rtol=1e-5 * condition, atol=1e-5)
 
 
+def test_one_matrix_solves_many_right_sides():
+    matrix, _ = positive(3, 1, 6, 100)
+    values = np.random.default_rng(0).normal(size=(50, 6)).astype(np.float32)
+    expected = np.linalg.solve(matrix[0], values.T.astype(float)).T
+    np.testing.assert_allclose(solve(matrix[0].astype(np.float32), values), expected, rtol=2e-3)
+
+
 @pytest.mark.parametrize("shapes", [((3, 3), (3, 3)), ((6, 6), (6,)), ((5, 2, 4), (5, 4, 3))])
 def test_products_are_those_of_numpy_in_float64(shapes):
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The weights of returns, in a complete map and in one that grows."""
+"""The weights of returns, in a complete map and in one that grows, and the steps from them."""
 
 import dataclasses
 from functools import partial
@@ -10,6 +10,7 @@ import pytest
 from room import CONFIG, HALF, room_cloud
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.mapping.registration import equations
 from hiosdf_jax._src.mapping.registration.equations import compare, make_rows
 from hiosdf_jax._src.state import field_of
 
@@ -98,3 +99,36 @@ def test_a_sheet_whose_sides_are_free_holds_returns_from_both():
         for way_m in (-0.01, 0.0, 0.01):
             ends = np.float32([1, 0.8, 0.8]) * sheet + np.float32([way_m, 0, 0])
             assert seen_from(field_of(state), ends, side) > 0.8
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_without_directions_a_step_is_that_along_the_axes(with_prior):
+    rng = np.random.default_rng(0)
+    rows = equations.make_rows(jnp.ones((50, 3)), jnp.ones(50, bool), (0.01, 0.001))
+    flags = jnp.ones(50, bool)
+    residuals = equations.Residuals(
+        distance=jnp.float32(rng.normal(size=50)),
+        jacobian=jnp.float32(rng.normal(size=(50, 6))),
+        sigma=jnp.ones(50),
+        comparable=flags,
+        contrary=~flags,
+        weight=jnp.float32(rng.uniform(0.5, 2, 50)),
+        points_world=jnp.ones((50, 3)),
+    )
+    away = jnp.eye(4).at[0, 3].set(0.1)
+    anchor = equations.Anchor(away, 3 * jnp.eye(6) if with_prior else None)
+    axes = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
+    found, expected = (
+        equations.find_step(residuals, directions, anchor, rows, jnp.eye(4), 2.0, 1e-3)
+        for directions in (None, axes)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
+    normal = np.asarray(residuals.jacobian, float).T * np.asarray(residuals.weight, float) / 2
+    information = normal @ np.asarray(residuals.jacobian, float)
+    slope = normal @ np.asarray(residuals.distance, float)
+    information += 1e-3 * np.trace(information) / 6 * np.eye(6)
+    if with_prior:
+        information += 3 * np.eye(6)
+        slope += 3 * np.array([-0.1, 0, 0, 0, 0, 0])
+    wanted = -np.linalg.solve(information, slope) / np.asarray(equations.units(rows))
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)

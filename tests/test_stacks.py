@@ -160,9 +160,10 @@ def test_shard_map_of_an_update_and_of_a_trajectory(empty_map, fields):
 
     maps = jax.tree.map(lambda leaf: leaf[None], empty_map)
     cloud, pose = (jnp.asarray(part)[None] for part in stream(1)[0])
-    sharded = jax.shard_map(update, mesh=mesh, in_specs=(one, one, one), out_specs=one)
-    after = jax.eval_shape(sharded, maps, cloud, pose)
-    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, maps)
+    for theirs in (one, PartitionSpec()):  # a cloud for each map, or one for all
+        sharded = jax.shard_map(update, mesh=mesh, in_specs=(one, theirs, theirs), out_specs=one)
+        after = jax.eval_shape(sharded, maps, cloud, pose)
+        assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, maps)
 
     def plan(field, path):
         return planning.optimize_trajectory(field, path, radius_m=0.1, steps=2).clearance

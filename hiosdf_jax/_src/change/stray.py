@@ -58,11 +58,11 @@ def find_stray(rays: Rays) -> jax.Array:
 def _count_by_pairs(counted: jax.Array, place: Place) -> tuple[jax.Array, jax.Array]:
     """Counts returns in the cells around each, and those in the bins around as well."""
     line, column, bin_of = (jnp.abs(part[:, None] - part) <= 1 for part in place)
-    # Both counts in one sum: for two sums a GPU stores the mask of all pairs.
-    number = jnp.where(bin_of, _MOST_BY_PAIRS + 2, 1)
-    total = jnp.sum(jnp.where(counted & line & column, number, 0), axis=1)
-    both = total // (_MOST_BY_PAIRS + 1)
-    return total - both * (_MOST_BY_PAIRS + 1), both
+    # Two digits of one sum: for two sums a GPU stores the mask of all pairs.
+    base = _MOST_BY_PAIRS + 1  # more than either count
+    digits = jnp.where(bin_of, base + 1, 1)
+    total = jnp.sum(jnp.where(counted & line & column, digits, 0), axis=1)
+    return total % base, total // base
 
 
 def _count_by_table(counted: jax.Array, place: Place) -> tuple[jax.Array, jax.Array]:

@@ -133,7 +133,7 @@ def drop_vanished(
         return jax.lax.fori_loop(0, _SPREADS, once, vanished, unroll=rounds_per_step(_SPREADS))
 
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_IF_MET
-    vanished = run_if(many, spread, vanished, window)
+    vanished = run_if(many, spread, vanished, window, rays)
     window = window._replace(change=put(change, counted))
     return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
 

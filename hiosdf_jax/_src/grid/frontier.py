@@ -12,7 +12,7 @@ from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
-from hiosdf_jax._src.numerics.shifts import hold, pad_axis
+from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
 
 _INFINITE = 1e12  # squared voxels
@@ -43,8 +43,8 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
     """Finds the least distance over shifts: to the shifted voxel, or to what it is near."""
     reach = min(reach, inside.shape[axis] - 1)
     # The remaining distance across the axis, for a voxel inside and for one outside.
-    to_outside = hold(pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE))
-    to_inside = hold(pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE))
+    to_outside = pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE).held()
+    to_inside = pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE).held()
 
     def compare(k: jax.Array, best: jax.Array) -> jax.Array:
         for step in (-k, k):

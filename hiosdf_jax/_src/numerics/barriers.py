@@ -26,6 +26,22 @@ def compute_once(tree: Any) -> Any:
     return jax.lax.optimization_barrier(tree)
 
 
+def hold(tree: Any) -> Any:
+    """Has arrays computed by kernels of their own on a GPU.
+
+    There XLA may otherwise compute them again in each kernel that reads them.
+
+    Args:
+        tree: A pytree of arrays.
+
+    Returns:
+        The same values. Differentiable.
+    """
+    if jax.default_backend() == "cpu":
+        return tree
+    return jax.lax.optimization_barrier(tree)
+
+
 @jax.custom_jvp
 def differentiate_once(tree: Any) -> Any:
     """Returns arrays; derivatives by them are computed once, however many others need them.

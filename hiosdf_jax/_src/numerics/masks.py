@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.barriers import hold
 from hiosdf_jax._src.numerics.modes import varying_like
 
 WORD = 32  # bits
@@ -47,10 +48,8 @@ def rank_mask(mask: jax.Array) -> RankedMask:
 
 def pack_mask(mask: jax.Array) -> jax.Array:
     """Packs a mask (...), not empty, into words, as in `RankedMask`."""
-    mask = mask.ravel()
-    if jax.default_backend() != "cpu":
-        # Otherwise one kernel may compute all that leads to the mask, as slowly as it sums bits.
-        mask = jax.lax.optimization_barrier(mask)
+    # A kernel that sums bits is slow. It must not also compute the mask.
+    mask = hold(mask.ravel())
     bits = jnp.pad(mask, (0, -mask.size % WORD)).reshape(-1, WORD).astype(jnp.uint32)
     return jnp.sum(bits << jnp.arange(WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
 

@@ -117,13 +117,15 @@ def run_if(pred: jax.Array, function: Callable[[Any], Any], value: Any, *others:
     Returns:
         The function's result where `pred` holds, else `value`.
     """
-    done = varying_like(jnp.zeros((), bool), pred, value, others)
-    start = varying_like((pred, jax.lax.stop_gradient(value)), pred, value, others)
 
+    def vary(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return varying_like(jax.lax.stop_gradient(carry), pred, value, others)
+
+    # XLA must see that the loop runs once at most: else it may do the work before the loop.
     def body(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        return done, jax.lax.stop_gradient(function(carry[1]))
+        return vary((jnp.zeros((), bool), function(carry[1])))
 
-    return jax.lax.while_loop(lambda carry: carry[0], body, start)[1]
+    return jax.lax.while_loop(lambda carry: carry[0], body, vary((pred, value)))[1]
 
 
 def _varying_axes(leaf: jax.Array) -> frozenset[Any]:

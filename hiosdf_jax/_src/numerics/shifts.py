@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.barriers import hold
 from hiosdf_jax._src.numerics.modes import cond
 
 
@@ -35,6 +36,13 @@ class Padded(NamedTuple):
         values = jax.lax.dynamic_slice_in_dim(self.values, first, size + 2 * self.reach, self.axis)
         return self._replace(values=values)
 
+    def held(self) -> Padded:
+        """Has the array computed once on a GPU, where a step of a loop reads many shifts of it.
+
+        A CPU takes one shift per step; there the frontier would take 1.2 times as long.
+        """
+        return self._replace(values=hold(self.values))
+
 
 def pad_axis(array: jax.Array, axis: int, reach: int, fill: float = 0) -> Padded:
     """Pads an array along an axis.
@@ -51,16 +59,6 @@ def pad_axis(array: jax.Array, axis: int, reach: int, fill: float = 0) -> Padded
     margin = [(0, 0)] * array.ndim
     margin[axis] = (reach, reach)
     return Padded(jnp.pad(array, margin, constant_values=fill), axis, reach)
-
-
-def hold(padded: Padded) -> Padded:
-    """Has a padded array computed once on a GPU, where a step of a loop reads many shifts of it.
-
-    A CPU takes one shift per step; there the frontier would take 1.2 times as long.
-    """
-    if jax.default_backend() == "cpu":
-        return padded
-    return padded._replace(values=jax.lax.optimization_barrier(padded.values))
 
 
 def with_neighbors(mask: jax.Array) -> jax.Array:

@@ -14,11 +14,11 @@ _LEAST_PIVOT = 1e-5
 
 
 def product(first: jax.Array, second: jax.Array) -> jax.Array:
-    """Multiplies matrices with exact float32 sums.
+    """Multiplies matrices in float32, where a GPU's library may round to fewer bits.
 
     Args:
         first: (..., M, K), K small.
-        second: (..., K, N), or a vector (K,).
+        second: Matrices (..., K, N), or one vector (K,).
 
     Returns:
         (..., M, N), or (..., M) for a vector.
@@ -33,7 +33,7 @@ def solve_positive(matrix: jax.Array, value: jax.Array) -> jax.Array:
 
     Args:
         matrix: Symmetric and positive definite, (..., K, K), K small; its lower half is read.
-        value: The right side, (..., K).
+        value: The right side, (..., K); its leading axes and those of `matrix` are broadcast.
 
     Returns:
         The solution, (..., K).

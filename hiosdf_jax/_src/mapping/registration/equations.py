@@ -410,7 +410,7 @@ def sizes(matrix: jax.Array) -> jax.Array:
 
 
 def _pull(directions: Directions | None, anchor: Anchor) -> jax.Array | None:
-    """The anchor's information, from motions to the directions' basis, (6, 6); None without it."""
+    """The anchor's information, from motions to the directions' basis, (6, 6), or None."""
     if directions is None:
         return anchor.information
     if anchor.information is None:

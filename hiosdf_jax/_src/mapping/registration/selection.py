@@ -51,7 +51,8 @@ def draw_informative(
     Args:
         jacobian: Derivative of each row's distance by the pose, (N, 6).
         weight: (N,), 0 for rows that are not to be used.
-        information: An invertible (6, 6) at least the weighted sum of the outer products.
+        information: Symmetric and positive definite, (6, 6), at least the weighted sum of the outer
+            products.
         count: Rows to select.
 
     Returns:

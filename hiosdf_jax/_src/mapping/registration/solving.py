@@ -30,6 +30,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
 from hiosdf_jax._src.mapping.registration.motion import move, way_and_angle
 from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.mapping.registration.uncertainty import inflation_of
+from hiosdf_jax._src.numerics.small_matrices import product
 from hiosdf_jax._src.state import Baked, Field
 
 # Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
@@ -69,9 +70,11 @@ _FINE_END_M = 0.004  # no tolerance below
 _FINE_STEPS = 24
 _WHOLE_STEPS = 16  # half steps then: the distance has kinks, around which whole ones may jump
 
-# The median error on held-out frames of a house is 0.27 cm and 0.047 degrees. It was 0.29 cm and
-# 0.051 degrees with 3,072 rows, and 0.28 cm and 0.047 degrees with 8,192.
+# From 5 cm and 3 degrees off, the median error on held-out frames of a house is 0.27 cm and 0.047
+# degrees. It is 0.29 cm and 0.051 degrees with 3,072 rows, and 0.28 cm and 0.047 with 8,192.
 _FINE_ROWS = 4096
+
+# Steps end once one is shorter than this, m. Poses are then 0.01 mm from where they would rest.
 _FINISHED_M = 5e-5
 _RESTING_M = 2e-3
 
@@ -161,7 +164,7 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
     information = information_of(residuals)
     # Free directions must not draw all rows.
     held = jnp.where(directions.free, jnp.trace(information), 0)
-    information += (directions.basis * held) @ directions.basis.T
+    information += product(directions.basis * held, directions.basis.T)
     information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6, dtype=jnp.float32)
     row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
     # A small cloud that is padded gives the same pose as without padding.
