@@ -64,7 +64,8 @@ def numpy_transforms(sites, offset, horizon, part, order=(2, 1, 0)):
 
 
 @pytest.mark.parametrize(
-    ("device", "number"), [("cpu", 50), ("cpu", 10**6), ("gpu", 8), ("gpu", 3)]
+    ("device", "number"),
+    [("cpu", 50), ("cpu", 10**6), ("gpu", 8), ("gpu", 3), ("a gpu's large map", 8)],
 )
 @pytest.mark.parametrize(("share", "horizon"), [(0.0005, 9), (0.0005, 16), (0.002, 25), (0.02, 40)])
 def test_axis_transforms_against_numpy(monkeypatch, share, horizon, device, number):
@@ -72,6 +73,8 @@ def test_axis_transforms_against_numpy(monkeypatch, share, horizon, device, numb
     where, name = (nearest, "_BLOCK") if device == "cpu" else (loops, "_ROUNDS_PER_STEP")
     monkeypatch.setattr(where, name, number)
     monkeypatch.setattr(jax, "default_backend", lambda: device)
+    if device == "a gpu's large map":
+        monkeypatch.setattr(nearest, "_SMALL", 0)
     rng = np.random.default_rng(11)
     sites = rng.random((40, 21, 13)) < share
     offset = rng.uniform(-0.5, 0.5, (*sites.shape, 3)).astype(np.float32)

@@ -6,19 +6,26 @@ at the center of its patch, not at that of its voxel.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hiosdf_jax._src.numerics.barriers import hold
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
 
 _INFINITE = 1e12  # squared voxels
+
+# Maps of up to this many voxels are taken for some of many on a GPU, see `_transform_twice`. An
+# update of 1,024 maps of 32,000 voxels takes 33.3 instead of 36.4 ms on an H200 with it.
+_SMALL = 200_000
+_ROUNDING = 1e-6  # of squared distances
 
 # A CPU transforms blocks of about this many voxels one after the other, so that they stay in its
 # cache. Blocks of 100,000 take 1.16 times as long, blocks of 6,000 1.26 times. A GPU transforms all
@@ -174,15 +181,54 @@ def _transform_block(
     along_axis = pad_axis(along, 1, reach).part(first, length).held()
     best = jax.lax.dynamic_slice_in_dim(squared, first, length, 1)
 
+    def candidate(step: jax.Array) -> jax.Array:
+        return across.shifted(step) + (step + along_axis.shifted(step)) ** 2
+
+    if jax.default_backend() != "cpu" and best.size <= _SMALL:
+        return _transform_twice(candidate, varying_like(best, squared, along), reach)
+
     def compare(k: jax.Array, found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         best, shift = found
         for step in (-k, k):
-            candidate = across.shifted(step) + (step + along_axis.shifted(step)) ** 2
-            shift = jnp.where(candidate < best, step, shift)
-            best = jnp.minimum(best, candidate)
+            other = candidate(step)
+            shift = jnp.where(other < best, step, shift)
+            best = jnp.minimum(best, other)
         return best, shift
 
     start = varying_like((best, jnp.zeros(best.shape, jnp.int32)), squared, along)
     return jax.lax.fori_loop(
         np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step()
     )
+
+
+def _transform_twice(
+    candidate: Callable[[jax.Array], jax.Array], own: jax.Array, reach: int
+) -> tuple[jax.Array, jax.Array]:
+    """Finds the least candidates first, and then their shifts.
+
+    XLA makes one kernel of several rounds of a loop that has one result. Of a loop with two results
+    it stores parts of each round, for all of many small maps. One large map gains nothing.
+
+    Args:
+        candidate: Maps a shift to the candidates that lie there.
+        own: The candidates at shift 0.
+        reach: Largest shift.
+
+    Returns:
+        The least candidates, and the shortest shifts that give them but for rounding errors, int32.
+    """
+
+    def compare(k: jax.Array, least: jax.Array) -> jax.Array:
+        return jnp.minimum(least, jnp.minimum(candidate(-k), candidate(k)))
+
+    def choose(number: jax.Array, shift: jax.Array) -> jax.Array:
+        k = reach - number
+        shift = jnp.where(candidate(k) <= most, k, shift)
+        return jnp.where(candidate(-k) <= most, -k, shift)
+
+    loop = functools.partial(jax.lax.fori_loop, unroll=rounds_per_step())
+    least = hold(loop(np.int32(1), np.int32(reach + 1), compare, own))
+    most = least + _ROUNDING * (jnp.abs(least) + 1)
+    start = varying_like(jnp.zeros(least.shape, jnp.int32), least)
+    shift = loop(np.int32(0), np.int32(reach), choose, start)
+    return least, jnp.where(own <= most, 0, shift)
