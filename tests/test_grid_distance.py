@@ -17,6 +17,9 @@ SIGNS = {
     "behind, few hits, rays pass": (-0.5, 5, 5, 0, 1),
     "in front, few hits, rays end before it": (0.5, 5, 0, 1, -1),
     "few hits, no ray": (-0.5, 5, 0, 0, -1),
+    "near, few of many rays pass": (-0.5, 5, 1, 20, -1),
+    "far, few of many rays pass": (-1.6, 50, 1, 20, 1),
+    "far, fewer of many rays pass": (-1.6, 50, 1, 60, -1),
     "far behind": (-4.0, 50, 0, 9, -1),
     "farther behind than rays mark voxels": (-7.0, 50, 0, 9, 1),
 }

@@ -3,9 +3,11 @@
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from voxels import (
+    BOUNDS,
     CONFIG,
     anywhere,
     distance_at,
@@ -16,6 +18,7 @@ from voxels import (
     trace,
     uniform,
     update_distances,
+    update_frontier,
 )
 
 from hiosdf_jax._src.grid import evidence, lookup, patches
@@ -71,6 +74,20 @@ def test_the_gradient_is_that_of_the_value_between_patches_too(room):
     assert np.mean(error > 0.02) < 0.08  # where the value jumps or bends
 
 
+def seen_room(room):
+    """The room with its frontier: its inside is observed."""
+    return update_frontier(CONFIG, room, anywhere((0.3, 0.5, 0.6)))
+
+
+def any_sides(room):
+    """The room with a side and a state of observation drawn at random for each voxel."""
+    rng = np.random.default_rng(31)
+    side = rng.integers(-1, 4, CONFIG.grid_shape).astype(np.int8)
+    steps = rng.choice([-5, 5], CONFIG.grid_shape).astype(np.int8)
+    derived = room.derived.replace(side=jnp.asarray(side), frontier_steps=jnp.asarray(steps))
+    return room.replace(derived=derived)
+
+
 def patch_at(grid, cell, point):
     """Distance of a point from the patch of a voxel, and height above its plane, float64 voxels."""
     mean = np.asarray(grid.evidence.mean[tuple(cell)], np.float64) + cell + 0.5
@@ -83,12 +100,33 @@ def patch_at(grid, cell, point):
     return np.linalg.norm(offset), height
 
 
+def space_around(derived, point, own):
+    """Shares of the space around a point by side: of its own voxel alone in unseen space."""
+    shares = {Side.FREE: 0.0, Side.BEHIND: 0.0, "other": 0.0}
+    cells = [(1.0, own)]
+    if derived.frontier_steps[own] > 0:
+        base = np.floor(point - 0.5).astype(int)
+        cells = []
+        for corner in itertools.product((0, 1), repeat=3):
+            cell = tuple(base + corner)
+            inside = all(0 <= c < n for c, n in zip(cell, CONFIG.grid_shape, strict=True))
+            if inside and derived.frontier_steps[cell] > 0:
+                weight = np.prod(np.where(corner, point - 0.5 - base, 1 - (point - 0.5 - base)))
+                cells.append((weight, cell))
+    for weight, cell in cells:
+        side = int(derived.side[cell])
+        key = side if side in (Side.FREE, Side.BEHIND) else "other"
+        shares[key] += weight / sum(weight for weight, _ in cells)
+    return shares
+
+
 def slow_distance(grid, point_world):
     """The signed distance at one point, m, one voxel after the other in float64."""
     point = point_world / 0.1 - CONFIG.corner_index
     shape, derived = np.array(CONFIG.grid_shape), grid.derived
-    own = int(derived.side[tuple(np.clip(np.floor(point).astype(int), 0, shape - 1))])
+    own = tuple(np.clip(np.floor(point).astype(int), 0, shape - 1))
     base = np.floor(point - 0.5).astype(int)
+    shares = space_around(derived, point, own)
     found = []
     for corner in itertools.product((0, 1), repeat=3):
         cell = base + corner
@@ -106,9 +144,9 @@ def slow_distance(grid, point_world):
             value = abs(height)
         else:
             value = max(1.5 * height, -distance) if height < 0 else height
-        limit = max(min(distance, 0.29 - 1.4 * (distance - 0.29)), -distance)
-        value = max(value, -limit) if own == Side.FREE else value
-        value = min(value, limit) if own == Side.BEHIND else value
+        limit = max(min(distance, 0.34 - 1.4 * (distance - 0.34)), -distance)
+        free, behind = shares[Side.FREE], shares[Side.BEHIND]
+        value = free * max(value, -limit) + behind * min(value, limit) + shares["other"] * value
         found.append((distance, max(weight, 1e-6), value, side))
     sided = [row for row in found if row[3] != Side.UNKNOWN]
     found = sided or [(d, w, d, side) for d, w, _, side in found]
@@ -116,10 +154,16 @@ def slow_distance(grid, point_world):
     return 0.1 * np.dot(weights, [value for _, _, value, _ in found]) / np.sum(weights)
 
 
-def test_distance_against_a_slow_reference(room):
-    points = uniform(12, 300)
-    value, _ = distance_at(surface_of(room), points)
-    known = jax.tree.map(np.asarray, room)
+@pytest.mark.parametrize("seen", ["nothing", "room", "anything"])
+def test_distance_against_a_slow_reference(room, seen):
+    grid = {
+        "nothing": lambda: room,
+        "room": lambda: seen_room(room),
+        "anything": lambda: any_sides(room),
+    }
+    grid, points = grid[seen](), uniform(12, 300)
+    value, _ = distance_at(surface_of(grid), points)
+    known = jax.tree.map(np.asarray, grid)
     expected = [slow_distance(known, point) for point in points.astype(np.float64)]
     np.testing.assert_allclose(value, expected, atol=1e-4)  # the axes are float16
 
@@ -150,6 +194,24 @@ def test_distance_changes_little_between_near_points(room):
     moved, _ = distance_at(surface_of(room), points + step)
     change = np.abs(np.asarray(moved) - value)
     assert change.max() < 0.005
+
+
+def test_distance_does_not_jump_where_free_voxels_meet_voxels_behind_a_surface(room):
+    """Whatever the sides of observed voxels are, and wherever patches are."""
+    rng = np.random.default_rng(32)
+    side = rng.choice([int(Side.FREE), int(Side.BEHIND)], CONFIG.grid_shape).astype(np.int8)
+    steps = jnp.full(CONFIG.grid_shape, 5, jnp.int8)
+    derived = room.derived.replace(side=jnp.asarray(side), frontier_steps=steps)
+    surface = surface_of(room.replace(derived=derived))
+    points = uniform(33, 20_000)
+    step = 2e-4 * uniform(34, 20_000, (-0.5,) * 3, (0.5,) * 3)
+    clipped = np.clip(points + step, *np.asarray(BOUNDS, np.float32))
+    value, moved = (
+        np.concatenate([distance_at(surface, part)[0] for part in np.split(each, 10)])
+        for each in (points, clipped)
+    )
+    assert np.mean(np.abs(value) > 0.1) > 0.05  # where a jump would be 20 cm
+    assert np.abs(moved - value).max() < 0.01
 
 
 def test_a_sheet_seen_from_both_sides_is_free_on_both():

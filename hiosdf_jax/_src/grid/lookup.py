@@ -36,10 +36,10 @@ _SOFT_VOXELS = 0.15
 # The only patch around a point counts also where its trilinear weight is 0.
 _LEAST_WEIGHT = 1e-6
 
-# A patch whose sign differs from that of the point's voxel counts up to the first distance, voxels.
-# From there on its distance falls by the slope, is 0 within half a voxel, and ends with the voxel's
-# sign.
-_OWN_SIGN_VOXELS = 0.29
+# A patch whose sign differs from that of the space around the point counts up to the first
+# distance, voxels. From there on its distance falls by the slope, is 0 within 0.6 voxels, and ends
+# with the sign of the space.
+_OWN_SIGN_VOXELS = 0.34
 _OWN_SIGN_SLOPE = 1.4
 
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
@@ -90,10 +90,8 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     found, distance = patch.found, patch.distance
     any_found = jnp.any(found, axis=0)
 
-    sides = surface.derived.side.ravel()
-    side = sides[corners.flat]
-    index, _, _ = geometry.voxel_of(config, points_world)
-    signed = _signed(patch, side, sides[geometry.flat_index(config.grid_shape, split(index))])
+    side = surface.derived.side.ravel()[corners.flat]
+    signed = _signed(patch, side, _space_at(config, surface.derived, corners, side, points_world))
     # Voxels without a side abstain: voxels that `grow` adds must not change old answers.
     sided = found & (side != Side.UNKNOWN)
     any_sided = jnp.any(sided, axis=0)
@@ -270,11 +268,47 @@ def _patches_at(
     return _Patches(found, distance, height, above, normal, width, length(across), spread)
 
 
-def _signed(patch: _Patches, side: jax.Array, own: jax.Array) -> jax.Array:
+class _Space(NamedTuple):
+    """What rays have shown of the space around points: shares from 0 to 1, (...)."""
+
+    free: jax.Array
+    behind: jax.Array
+
+
+def _space_at(
+    config: Config,
+    derived: Derived,
+    corners: geometry.Corners,
+    side: jax.Array,
+    points_world: jax.Array,
+) -> _Space:
+    """Computes which shares of the space around points are free, and which lie behind surfaces.
+
+    In observed space they are interpolated between the observed voxels around the point, so that
+    the distance does not jump where free voxels meet voxels behind a surface and no patch lies
+    between them. Unobserved voxels only guess their sides: behind a wall, their interpolation would
+    reach into the room. In unseen space the voxel that contains the point decides.
+    """
+    index, _, _ = geometry.voxel_of(config, points_world)
+    own = geometry.flat_index(config.grid_shape, split(index))
+    steps = derived.frontier_steps.ravel()
+    own_side, observed = derived.side.ravel()[own], steps[own] > 0
+    weight = jnp.where(corners.inside & (steps[corners.flat] > 0), corners.weight, 0)
+    # At least 1 / 8 in observed space: the point's own voxel is one of the eight.
+    total = jnp.where(observed, jnp.sum(weight, axis=0), 1)
+
+    def share(kind: Side) -> jax.Array:
+        between = jnp.sum(jnp.where(side == kind, weight, 0), axis=0) / total
+        return jnp.where(observed, between, own_side == kind)
+
+    return _Space(share(Side.FREE), share(Side.BEHIND))
+
+
+def _signed(patch: _Patches, side: jax.Array, space: _Space) -> jax.Array:
     """Computes the signed distance to each of the patches around points, (8, ...) voxels.
 
     It is the height above the patch's plane unless the patch's voxel is free. Away from patches all
-    have the sign of the voxel that contains the point, whose side is `own`.
+    have the sign of the space around the point.
     """
     distance = patch.distance
     height = jnp.where(patch.height < 0, _BEHIND_SLOPE * patch.height, patch.height)
@@ -282,8 +316,9 @@ def _signed(patch: _Patches, side: jax.Array, own: jax.Array) -> jax.Array:
     signed = jnp.where(side == Side.SHEET, jnp.abs(patch.height), signed)
     falling = _OWN_SIGN_VOXELS - _OWN_SIGN_SLOPE * (distance - _OWN_SIGN_VOXELS)
     limit = jnp.maximum(jnp.minimum(distance, falling), -distance)
-    signed = jnp.where(own == Side.FREE, jnp.maximum(signed, -limit), signed)
-    return jnp.where(own == Side.BEHIND, jnp.minimum(signed, limit), signed)
+    free = space.free * jnp.maximum(signed, -limit)
+    behind = space.behind * jnp.minimum(signed, limit)
+    return free + behind + (1 - space.free - space.behind) * signed
 
 
 def grid_sdf(config: Config, surface: Surface, points_world: jax.Array) -> jax.Array:
