@@ -42,6 +42,10 @@ _LEAST_WEIGHT = 1e-6
 _OWN_SIGN_VOXELS = 0.34
 _OWN_SIGN_SLOPE = 1.4
 
+# Where the observed voxels around a point have this trilinear weight, the others have no say in
+# which space it lies. In observed space they always have it.
+_OBSERVED_WEIGHT = 0.125
+
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
 # patch, the height alone would be too near.
 _BEHIND_SLOPE = 1.5
@@ -91,7 +95,7 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     any_found = jnp.any(found, axis=0)
 
     side = surface.derived.side.ravel()[corners.flat]
-    signed = _signed(patch, side, _space_at(config, surface.derived, corners, side, points_world))
+    signed = _signed(patch, side, _space_at(surface.derived, corners, found, side))
     # Voxels without a side abstain: voxels that `grow` adds must not change old answers.
     sided = found & (side != Side.UNKNOWN)
     any_sided = jnp.any(sided, axis=0)
@@ -276,30 +280,23 @@ class _Space(NamedTuple):
 
 
 def _space_at(
-    config: Config,
-    derived: Derived,
-    corners: geometry.Corners,
-    side: jax.Array,
-    points_world: jax.Array,
+    derived: Derived, corners: geometry.Corners, found: jax.Array, side: jax.Array
 ) -> _Space:
     """Computes which shares of the space around points are free, and which lie behind surfaces.
 
-    In observed space they are interpolated between the observed voxels around the point, so that
-    the distance does not jump where free voxels meet voxels behind a surface and no patch lies
-    between them. Unobserved voxels only guess their sides: behind a wall, their interpolation would
-    reach into the room. In unseen space the voxel that contains the point decides.
+    They are interpolated between the voxels around the point, so that the distance does not jump
+    where free voxels meet voxels behind a surface and no patch lies between them. In observed space
+    only observed voxels count. The others guess their sides: what they guess behind a wall would
+    reach into the room.
     """
-    index, _, _ = geometry.voxel_of(config, points_world)
-    own = geometry.flat_index(config.grid_shape, split(index))
-    steps = derived.frontier_steps.ravel()
-    own_side, observed = derived.side.ravel()[own], steps[own] > 0
-    weight = jnp.where(corners.inside & (steps[corners.flat] > 0), corners.weight, 0)
-    # At least 1 / 8 in observed space: the point's own voxel is one of the eight.
-    total = jnp.where(observed, jnp.sum(weight, axis=0), 1)
+    seen = derived.frontier_steps.ravel()[corners.flat] > 0
+    weight = jnp.where(found, corners.weight, 0)
+    observed = jnp.sum(jnp.where(seen, weight, 0), axis=0)
+    weight = weight * jnp.where(seen, 1, jnp.clip(1 - observed / _OBSERVED_WEIGHT, 0, 1))
+    total = jnp.maximum(jnp.sum(weight, axis=0), _LEAST_WEIGHT)
 
     def share(kind: Side) -> jax.Array:
-        between = jnp.sum(jnp.where(side == kind, weight, 0), axis=0) / total
-        return jnp.where(observed, between, own_side == kind)
+        return jnp.sum(jnp.where(side == kind, weight, 0), axis=0) / total
 
     return _Space(share(Side.FREE), share(Side.BEHIND))
 
