@@ -108,7 +108,7 @@ def space_around(derived, corners):
     for weight, cell in corners:
         side = int(derived.side[cell])
         key = side if side in (Side.FREE, Side.BEHIND) else "other"
-        shares[key] += weight * (1 if derived.frontier_steps[cell] > 0 else guessing)
+        shares[key] += weight**2 * (1 if derived.frontier_steps[cell] > 0 else guessing)
     return {key: share / sum(shares.values()) for key, share in shares.items()}
 
 

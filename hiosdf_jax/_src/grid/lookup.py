@@ -292,7 +292,8 @@ def _space_at(
     seen = derived.frontier_steps.ravel()[corners.flat] > 0
     weight = jnp.where(found, corners.weight, 0)
     observed = jnp.sum(jnp.where(seen, weight, 0), axis=0)
-    weight = weight * jnp.where(seen, 1, jnp.clip(1 - observed / _OBSERVED_WEIGHT, 0, 1))
+    # Squared: the slope of the distance is then wrong in a narrower seam.
+    weight = weight**2 * jnp.where(seen, 1, jnp.clip(1 - observed / _OBSERVED_WEIGHT, 0, 1))
     total = jnp.maximum(jnp.sum(weight, axis=0), _LEAST_WEIGHT)
 
     def share(kind: Side) -> jax.Array:
