@@ -127,7 +127,7 @@ def slow_distance(grid, point_world):
         jump = np.asarray(derived.nearest[cell], int)
         distance, height = patch_at(grid, np.array(cell) + jump, point)
         side = int(derived.side[cell])
-        if side == Side.FREE:
+        if side in (Side.FREE, Side.UNKNOWN):
             value = distance
         elif side == Side.SHEET:
             value = abs(height)
@@ -136,11 +136,9 @@ def slow_distance(grid, point_world):
         limit = max(min(distance, 0.34 - 1.4 * (distance - 0.34)), -distance)
         free, behind = shares[Side.FREE], shares[Side.BEHIND]
         value = free * max(value, -limit) + behind * min(value, limit) + shares["other"] * value
-        found.append((distance, max(weight, 1e-6), value, side))
-    sided = [row for row in found if row[3] != Side.UNKNOWN]
-    found = sided or [(d, w, d, side) for d, w, _, side in found]
-    weights = [w * np.exp(-d / 0.15) for d, w, _, _ in found]
-    return 0.1 * np.dot(weights, [value for _, _, value, _ in found]) / np.sum(weights)
+        found.append((max(weight, 1e-6) * np.exp(-distance / 0.15), value))
+    weights, values = zip(*found, strict=True)
+    return 0.1 * np.dot(weights, values) / np.sum(weights)
 
 
 @pytest.mark.parametrize("seen", ["nothing", "room", "anything"])
@@ -188,7 +186,7 @@ def test_distance_changes_little_between_near_points(room):
 def test_distance_does_not_jump_where_free_voxels_meet_voxels_behind_a_surface(room):
     """Whatever the sides of voxels are, whichever were observed, and wherever patches are."""
     rng = np.random.default_rng(32)
-    side = rng.choice([int(Side.FREE), int(Side.BEHIND)], CONFIG.grid_shape).astype(np.int8)
+    side = rng.integers(Side.BEHIND, Side.FREE, CONFIG.grid_shape, np.int8, endpoint=True)
     steps = rng.choice([-5, 5], CONFIG.grid_shape).astype(np.int8)
     derived = room.derived.replace(side=jnp.asarray(side), frontier_steps=jnp.asarray(steps))
     surface = surface_of(room.replace(derived=derived))

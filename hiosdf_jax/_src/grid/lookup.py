@@ -95,18 +95,13 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     any_found = jnp.any(found, axis=0)
 
     side = surface.derived.side.ravel()[corners.flat]
-    signed = _signed(patch, side, _space_at(surface.derived, corners, found, side))
-    # Voxels without a side abstain: voxels that `grow` adds must not change old answers.
-    sided = found & (side != Side.UNKNOWN)
-    any_sided = jnp.any(sided, axis=0)
-    counts = jnp.where(any_sided, sided, found)
-    value = jnp.where(any_sided, signed, distance)
+    value = _signed(patch, side, _space_at(surface.derived, corners, found, side))
 
     # It cancels from the mean, and so does its derivative.
     least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)
     # Not by a minimum: at the nearest patch it would halve the derivative.
     nearness = jnp.exp(jnp.where(found, least - distance, 0) / _SOFT_VOXELS)
-    weight = jnp.where(counts, jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness, 0)
+    weight = jnp.where(found, jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness, 0)
     total = jnp.where(any_found, jnp.sum(weight, axis=0), 1)
     sdf_m = jnp.sum(weight * value, axis=0) / total * config.voxel_size
     spread_m = jnp.sum(weight * patch.spread, axis=0) / total * config.voxel_size
@@ -305,12 +300,13 @@ def _space_at(
 def _signed(patch: _Patches, side: jax.Array, space: _Space) -> jax.Array:
     """Computes the signed distance to each of the patches around points, (8, ...) voxels.
 
-    It is the height above the patch's plane unless the patch's voxel is free. Away from patches all
-    have the sign of the space around the point.
+    It is the height above the patch's plane, unless the voxel that knows the patch is free or has
+    no side. Away from patches all have the sign of the space around the point.
     """
     distance = patch.distance
     height = jnp.where(patch.height < 0, _BEHIND_SLOPE * patch.height, patch.height)
-    signed = jnp.where(side == Side.FREE, distance, jnp.maximum(height, -distance))
+    unsigned = (side == Side.FREE) | (side == Side.UNKNOWN)
+    signed = jnp.where(unsigned, distance, jnp.maximum(height, -distance))
     signed = jnp.where(side == Side.SHEET, jnp.abs(patch.height), signed)
     falling = _OWN_SIGN_VOXELS - _OWN_SIGN_SLOPE * (distance - _OWN_SIGN_VOXELS)
     limit = jnp.maximum(jnp.minimum(distance, falling), -distance)
