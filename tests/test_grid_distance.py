@@ -18,6 +18,8 @@ SIGNS = {
     "in front, few hits, rays end before it": (0.5, 5, 0, 1, -1),
     "few hits, no ray": (-0.5, 5, 0, 0, -1),
     "near, few of many rays pass": (-0.5, 5, 1, 20, -1),
+    "less far, some of many rays pass": (-1.25, 50, 1, 15, 1),
+    "less far, few of many rays pass": (-1.25, 50, 1, 20, -1),
     "far, few of many rays pass": (-1.6, 50, 1, 20, 1),
     "far, fewer of many rays pass": (-1.6, 50, 1, 60, -1),
     "far behind": (-4.0, 50, 0, 9, -1),

@@ -19,7 +19,7 @@ _FREE_RATIO = 0.1
 
 # Fewer passes suffice far from patches: noise does not put ends of rays there. The share falls to
 # this one between these distances of the voxel's center from the nearest patch, voxels. In the
-# apartment it frees 148 voxels, 3 of which are solid.
+# apartment it frees about 150 voxels, 3 of which are solid.
 _FAR_FREE_RATIO = 0.02
 _FAR_VOXELS = (1.0, 1.5)
 

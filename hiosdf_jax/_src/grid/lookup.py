@@ -43,7 +43,7 @@ _OWN_SIGN_VOXELS = 0.34
 _OWN_SIGN_SLOPE = 1.4
 
 # Where the observed voxels around a point have this trilinear weight, the others have no say in
-# which space it lies. In observed space they always have it.
+# which space it lies. In observed space they always have it: the point's own voxel has an eighth.
 _OBSERVED_WEIGHT = 0.125
 
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
@@ -285,10 +285,11 @@ def _space_at(
     reach into the room.
     """
     seen = derived.frontier_steps.ravel()[corners.flat] > 0
-    weight = jnp.where(found, corners.weight, 0)
-    observed = jnp.sum(jnp.where(seen, weight, 0), axis=0)
+    trilinear = jnp.where(found, corners.weight, 0)
+    observed = jnp.sum(jnp.where(seen, trilinear, 0), axis=0)
+    guess = jnp.clip(1 - observed / _OBSERVED_WEIGHT, 0, 1)
     # Squared: the slope of the distance is then wrong in a narrower seam.
-    weight = weight**2 * jnp.where(seen, 1, jnp.clip(1 - observed / _OBSERVED_WEIGHT, 0, 1))
+    weight = trilinear**2 * jnp.where(seen, 1, guess)
     total = jnp.maximum(jnp.sum(weight, axis=0), _LEAST_WEIGHT)
 
     def share(kind: Side) -> jax.Array:
