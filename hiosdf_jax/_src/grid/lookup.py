@@ -42,10 +42,6 @@ _LEAST_WEIGHT = 1e-6
 _OWN_SIGN_VOXELS = 0.34
 _OWN_SIGN_SLOPE = 1.4
 
-# Where the observed voxels around a point have this trilinear weight, the others have no say in
-# which space it lies. In observed space they always have it: the point's own voxel has an eighth.
-_OBSERVED_WEIGHT = 0.125
-
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
 # patch, the height alone would be too near.
 _BEHIND_SLOPE = 1.5
@@ -95,7 +91,7 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     any_found = jnp.any(found, axis=0)
 
     side = surface.derived.side.ravel()[corners.flat]
-    value = _signed(patch, side, _space_at(surface.derived, corners, found, side))
+    value = _signed(patch, side, _space_at(config, surface.derived, corners, side, points_world))
 
     # It cancels from the mean, and so does its derivative.
     least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)
@@ -275,25 +271,32 @@ class _Space(NamedTuple):
 
 
 def _space_at(
-    derived: Derived, corners: geometry.Corners, found: jax.Array, side: jax.Array
+    config: Config,
+    derived: Derived,
+    corners: geometry.Corners,
+    side: jax.Array,
+    points_world: jax.Array,
 ) -> _Space:
     """Computes which shares of the space around points are free, and which lie behind surfaces.
 
-    They are interpolated between the voxels around the point, so that the distance does not jump
-    where free voxels meet voxels behind a surface and no patch lies between them. In observed space
-    only observed voxels count. The others guess their sides: what they guess behind a wall would
-    reach into the room.
+    In observed space they are interpolated between the observed voxels around the point, so that
+    the distance does not jump where free voxels meet voxels behind a surface and no patch lies
+    between them. Unobserved voxels guess their sides: what they guess behind a wall would reach
+    into the room. In unseen space the voxel that contains the point decides: interpolated guesses
+    would push waypoints deeper into new obstacles.
     """
-    seen = derived.frontier_steps.ravel()[corners.flat] > 0
-    trilinear = jnp.where(found, corners.weight, 0)
-    observed = jnp.sum(jnp.where(seen, trilinear, 0), axis=0)
-    guess = jnp.clip(1 - observed / _OBSERVED_WEIGHT, 0, 1)
+    index, _, _ = geometry.voxel_of(config, points_world)
+    own = geometry.flat_index(config.grid_shape, split(index))
+    steps = derived.frontier_steps.ravel()
+    own_side, observed = derived.side.ravel()[own], steps[own] > 0
+    seen = corners.inside & (steps[corners.flat] > 0)
     # Squared: the slope of the distance is then wrong in a narrower seam.
-    weight = trilinear**2 * jnp.where(seen, 1, guess)
-    total = jnp.maximum(jnp.sum(weight, axis=0), _LEAST_WEIGHT)
+    weight = jnp.where(seen, corners.weight**2, 0)
+    total = jnp.where(observed, jnp.sum(weight, axis=0), 1)
 
     def share(kind: Side) -> jax.Array:
-        return jnp.sum(jnp.where(side == kind, weight, 0), axis=0) / total
+        between = jnp.sum(jnp.where(side == kind, weight, 0), axis=0) / total
+        return jnp.where(observed, between, own_side == kind)
 
     return _Space(share(Side.FREE), share(Side.BEHIND))
 
