@@ -147,12 +147,8 @@ def slow_distance(grid, point_world):
 
 @pytest.mark.parametrize("seen", ["nothing", "room", "anything"])
 def test_distance_against_a_slow_reference(room, seen):
-    grid = {
-        "nothing": lambda: room,
-        "room": lambda: seen_room(room),
-        "anything": lambda: any_sides(room),
-    }
-    grid, points = grid[seen](), uniform(12, 300)
+    change = {"nothing": lambda room: room, "room": seen_room, "anything": any_sides}
+    grid, points = change[seen](room), uniform(12, 300)
     value, _ = distance_at(surface_of(grid), points)
     known = jax.tree.map(np.asarray, grid)
     expected = [slow_distance(known, point) for point in points.astype(np.float64)]
@@ -188,7 +184,7 @@ def test_distance_changes_little_between_near_points(room):
 
 
 def test_distance_does_not_jump_where_free_voxels_meet_voxels_behind_a_surface(room):
-    """Whatever the sides of voxels are and whichever were observed, but from unseen space."""
+    """In observed space, whatever the sides of voxels are and whichever were observed."""
     rng = np.random.default_rng(32)
     side = rng.integers(Side.BEHIND, Side.FREE, CONFIG.grid_shape, np.int8, endpoint=True)
     steps = rng.choice([-5, 5], CONFIG.grid_shape, p=[0.2, 0.8]).astype(np.int8)
