@@ -56,7 +56,7 @@ def test_cells_are_the_records_figures():
         f"{mean['visible_cm']:.2f}",
         f"{mean['recall']:.3f} / {mean['fpr']:.3f} |",
     ]
-    record = json.loads((records.RESULTS / "speed_h200.json").read_text())
+    record = json.loads((records.RESULTS / "speed_gpu.json").read_text())
     times = {row["name"]: row for row in record["rows"]}
     torch = record["baselines"]["training"][-1]
     assert "TF32" in torch["name"]

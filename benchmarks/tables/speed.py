@@ -15,7 +15,7 @@ Record = dict[str, Any]  # what the command `benchmarks.speed` writes
 
 def gpu() -> str:
     """Updates, training and queries on one GPU."""
-    record = records.read(records.RESULTS / "speed_h200.json")
+    record = _record("gpu")
     training = "the paper's training, 10 epochs of 60,000"
     rows = {
         "an update, `Config.default`": "update, default",
@@ -41,12 +41,12 @@ def gpu() -> str:
         for label, name in rows.items()
     ]
     columns = ["median", "p99", "compiled function alone", "PyTorch eager, TF32"]
-    return lay_out(["one H200, ms", *columns], cells)
+    return lay_out([f"one {_card(record)}, ms", *columns], cells)
 
 
 def cpu() -> str:
     """Updates, a whole run, training and queries on two CPU cores."""
-    record = records.read(records.RESULTS / "speed_cpu.json")
+    record = _record("cpu")
     rows = {
         "an update, `Config.light`": "update, light",
         "the first update, which compiles": "compilation of update, light",
@@ -71,7 +71,7 @@ def cpu() -> str:
 
 def stages() -> str:
     """The stages of an update one by one, on a GPU and on two CPU cores."""
-    gpu, cpu = (records.read(records.RESULTS / f"speed_{one}.json") for one in ("h200", "cpu"))
+    gpu, cpu = _record("gpu"), _record("cpu")
     known = {stage.__name__ for stage in STAGES}
     names = [row["name"].removesuffix(", paper") for row in gpu["rows"]]
     cells = [
@@ -83,12 +83,13 @@ def stages() -> str:
         for name in names
         if known.issuperset(name.split(" + "))  # a record may have two stages in one row
     ]
-    return lay_out(["stage, ms", "H200, `Config.paper`", "two CPU cores, `Config.light`"], cells)
+    columns = [f"{_card(gpu)}, `Config.paper`", "two CPU cores, `Config.light`"]
+    return lay_out(["stage, ms", *columns], cells)
 
 
 def ratios() -> str:
     """How an update grows with the map and with the number of updates."""
-    record = records.read(records.RESULTS / "speed_h200.json")
+    record = _record("gpu")
     sizes = [_row(record, f"update, light, a map of {edge} m") for edge in (60, 10)]
     last = "10,000 updates in a row, light, last 10 %"
     ends = [_row(record, last), _beside(record, last)]
@@ -99,12 +100,12 @@ def ratios() -> str:
             ("last thousand of 10,000 updates : first thousand", ends),
         )
     ]
-    return lay_out(["`Config.light`, one H200, medians", "ratio"], cells)
+    return lay_out([f"`Config.light`, one {_card(record)}, medians", "ratio"], cells)
 
 
 def many() -> str:
     """Points one by one, and many small maps, on one GPU."""
-    record = records.read(records.RESULTS / "speed_h200.json")
+    record = _record("gpu")
     cells = []
     for count in ("102,400", "1,048,576"):
         for function in ("sdf", "value_and_grad(sdf)"):
@@ -117,7 +118,7 @@ def many() -> str:
         ("256 distances in each of them", f"256 distances in each of {maps}"),
     ):
         cells.append([label, _number(_row(record, name), "median"), ""])
-    return lay_out(["one H200, ms", "median", "as one batch"], cells)
+    return lay_out([f"one {_card(record)}, ms", "median", "as one batch"], cells)
 
 
 TABLES = {
@@ -127,6 +128,15 @@ TABLES = {
     "speed-stages": stages,
     "speed-ratios": ratios,
 }
+
+
+def _record(device: str) -> Record:
+    return records.read(records.RESULTS / f"speed_{device}.json")
+
+
+def _card(record: Record) -> str:
+    """The GPU's short name, such as H200 for NVIDIA H200."""
+    return record["device"].split()[1]
 
 
 def _row(record: Record, name: str) -> dict[str, Any]:
