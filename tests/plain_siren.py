@@ -6,6 +6,7 @@ import pytest
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.network import evaluation
+from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.samples.draw import Samples
 
 BOUNDS = ((-1, -1, -1), (1, 1, 1))
@@ -51,6 +52,6 @@ def interpret_kernels(monkeypatch, multiprocessors):
     mosaic = pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
     if not hasattr(mosaic, "InterpretGPUParams"):
         pytest.skip("this jax cannot interpret GPU kernels")
-    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
     monkeypatch.setattr(evaluation, "INTERPRET", mosaic.InterpretGPUParams())
     monkeypatch.setattr(evaluation, "multiprocessors", lambda: multiprocessors)

@@ -8,7 +8,7 @@ import pytest
 from voxels import BOUNDS, CONFIG, SHAPE, uniform
 
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.numerics.vectors import join
+from hiosdf_jax._src.numerics.vectors import join, split
 
 
 def test_voxels_are_aligned_with_the_world_origin():
@@ -43,7 +43,7 @@ def test_voxel_and_offset_do_not_depend_on_the_bounds():
 
 def test_corners_interpolate_affine_functions_exactly_up_to_the_border():
     points = uniform(2, 300)
-    corners = geometry.corners_of(CONFIG, points)
+    corners = geometry.corners_of(CONFIG, split(points))
     centers = geometry.voxel_center(CONFIG, join(corners.index))
     between = np.sum(centers * np.asarray(corners.weight)[..., None], axis=0)
     np.testing.assert_allclose(between, points, atol=1e-6)

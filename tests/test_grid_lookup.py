@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import clear, interpret_point_kernels
 from voxels import (
     BOUNDS,
     CONFIG,
@@ -232,3 +233,26 @@ def test_an_empty_grid_answers_the_horizon():
     value, gradient = distance_at(surface, uniform(15, 20))
     np.testing.assert_array_equal(value, np.full(20, 1.5, np.float32))
     assert np.isfinite(gradient).all()
+
+
+def answers(surface, points):
+    """All that the grid answers, and its gradients."""
+
+    def distances(point):
+        nearest = lookup.nearest_patch(CONFIG, surface, point)
+        doubt = lookup.doubt_distance(CONFIG, surface, point)
+        return nearest.sdf, nearest.spread, doubt, lookup.frontier_distance(CONFIG, surface, point)
+
+    return jax.jit(lambda: (distances(points), jax.vmap(jax.jacrev(distances))(points)))()
+
+
+def test_the_kernel_of_a_gpu_answers_as_xla_does(room, monkeypatch):
+    """The kernel is interpreted, at points in the grid and on its border."""
+    surface = surface_of(room)
+    points = jnp.clip(1.2 * uniform(5, 400), *jnp.asarray(BOUNDS, jnp.float32))
+    expected = answers(surface, points)
+    interpret_point_kernels(monkeypatch)
+    found = answers(surface, points)
+    clear()
+    for value, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(value, other, atol=1e-4)

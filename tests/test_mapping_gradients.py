@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid import geometry, patches
+from hiosdf_jax._src.numerics.vectors import split
 
 STEP = 1e-3  # m and rad; the map's float16 resolves 2e-5 m
 POINTS = (np.random.default_rng(1).uniform(-0.9, 0.9, (2000, 3)) * HALF).astype(np.float32)
@@ -57,7 +58,7 @@ def answers(base, state):
 
 def pieces(state):
     """What the answers are piecewise smooth in."""
-    corners = geometry.corners_of(CONFIG, jnp.asarray(POINTS)).flat
+    corners = geometry.corners_of(CONFIG, split(jnp.asarray(POINTS))).flat
     derived = state.grid.derived
     nearest = np.asarray(derived.nearest).reshape(-1, 3)[np.asarray(corners)]
     return np.concatenate([*nearest.transpose(2, 0, 1), np.asarray(derived.side).ravel()[corners]])

@@ -7,7 +7,8 @@ import pytest
 from plain_siren import BOUNDS, interpret_kernels, numpy_forward, numpy_gradient, some_samples
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.network import derivatives, evaluation, loss, siren, training
+from hiosdf_jax._src.network import derivatives, loss, siren, training
+from hiosdf_jax._src.numerics import devices
 
 pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
 
@@ -119,7 +120,7 @@ def test_the_gradient_is_constant_under_differentiation(interpreted):
     ],
 )
 def test_training_chooses_by_network_and_device(monkeypatch, width, least, platform, chosen):
-    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
     monkeypatch.setattr(derivatives, "_LEAST_ROWS", least)
     config = hio.Config.default(BOUNDS, hidden_width=width, hidden_layers=1)
     network, samples = training.init_network(config, jax.random.key(0)), some_samples(512)

@@ -10,6 +10,7 @@ from plain_siren import BOUNDS, interpret_kernels, numpy_forward, numpy_gradient
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.network import evaluation, siren
+from hiosdf_jax._src.numerics import devices
 
 pytest.importorskip("jax.experimental.pallas.mosaic_gpu")
 
@@ -80,9 +81,9 @@ def test_the_device_is_chosen_when_the_program_is_compiled(monkeypatch):
         return "mosaic_gpu" in traced.lower(lowering_platforms=(platform,)).as_text()
 
     monkeypatch.setattr(evaluation, "_LEAST_ROWS", 1)  # on a CPU, points come in tiles
-    assert not evaluation.is_available()
+    assert not devices.has_kernels()
     assert not has_kernel("cuda")
-    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
     assert has_kernel("cuda")
     assert not has_kernel("cpu")
 
@@ -90,7 +91,7 @@ def test_the_device_is_chosen_when_the_program_is_compiled(monkeypatch):
 @pytest.mark.parametrize(("width", "layers"), [(100, 2), (512, 4), (128, 9)])
 def test_other_networks_are_left_to_xla(monkeypatch, width, layers):
     monkeypatch.setattr(evaluation, "_LEAST_ROWS", 1)
-    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
     config, params = network(width, layers)
     program = jax.jit(lambda p, x: siren.predict(config, p, x))
     shape = jax.ShapeDtypeStruct((8192, 3), jnp.float32)
@@ -99,7 +100,7 @@ def test_other_networks_are_left_to_xla(monkeypatch, width, layers):
 
 
 def test_few_points_are_left_to_xla(monkeypatch):
-    monkeypatch.setattr(evaluation, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
     config, params = network(128, 1)
     program = jax.jit(lambda p, x: siren.predict(config, p, x))
     shape = jax.ShapeDtypeStruct((100, 3), jnp.float32)
@@ -115,12 +116,12 @@ def test_an_untried_jax_is_left_to_xla(monkeypatch):
 
     monkeypatch.setattr(jax, "devices", lambda: [Hopper()])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert evaluation.is_available() == (jax.__version_info__ < (0, 13))
+    assert devices.has_kernels() == (jax.__version_info__ < (0, 13))
     monkeypatch.setattr(jax, "__version_info__", (0, 13, 0))
-    assert not evaluation.is_available()
+    assert not devices.has_kernels()
     monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
     monkeypatch.setattr(Hopper, "compute_capability", "8.0")
-    assert not evaluation.is_available()
+    assert not devices.has_kernels()
     monkeypatch.setattr(Hopper, "compute_capability", "9.0")
     monkeypatch.setattr(jax, "devices", lambda: [Hopper(), Hopper()])
-    assert not evaluation.is_available()
+    assert not devices.has_kernels()

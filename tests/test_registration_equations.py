@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import clear, interpret_point_kernels
 from room import CONFIG, HALF, room_cloud
 
 import hiosdf_jax as hio
@@ -114,12 +115,15 @@ def test_without_directions_a_step_is_that_along_the_axes(with_prior):
         contrary=~flags,
         weight=jnp.float32(rng.uniform(0.5, 2, 50)),
         points_world=jnp.ones((50, 3)),
+        width=jnp.zeros(50),
     )
     away = jnp.eye(4).at[0, 3].set(0.1)
     anchor = equations.Anchor(away, 3 * jnp.eye(6) if with_prior else None)
     axes = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
     found, expected = (
-        equations.find_step(residuals, directions, anchor, rows, jnp.eye(4), 2.0, 1e-3)
+        equations.find_step(
+            equations.sums_of(residuals), directions, anchor, rows, jnp.eye(4), 2.0, 1e-3
+        )
         for directions in (None, axes)
     )
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
@@ -132,3 +136,22 @@ def test_without_directions_a_step_is_that_along_the_axes(with_prior):
         slope += 3 * np.array([-0.1, 0, 0, 0, 0, 0])
     wanted = -np.linalg.solve(information, slope) / np.asarray(equations.units(rows))
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_the_kernel_of_a_gpu_sums_what_arrays_sum(sharp_map, monkeypatch):
+    """The kernel is interpreted, for a few hundred returns of two poses."""
+    field, (cloud, pose) = field_of(sharp_map), returns()
+    rows = make_rows(cloud[:300], jnp.arange(300) % 7 > 0, (0.01, 0.001), 0.3)
+    rows = rows._replace(share=jnp.float32(0.6))
+    poses = jnp.stack([jnp.asarray(pose), jnp.asarray(pose).at[:3, 3].add(0.2)])
+
+    def sums(poses):
+        each = jax.vmap(lambda pose: equations.sum_returns(field, rows, pose, 0.1).values)
+        return np.asarray(jax.jit(each)(poses))
+
+    expected = sums(poses)
+    interpret_point_kernels(monkeypatch)
+    found = sums(poses)
+    clear()
+    assert (expected[:, 28] > 50).all()  # the map tells something of that many returns
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())

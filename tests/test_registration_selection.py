@@ -1,8 +1,13 @@
 """Which returns are selected."""
 
 import numpy as np
+import pytest
 
-from hiosdf_jax._src.mapping.registration.selection import draw_evenly, draw_informative
+from hiosdf_jax._src.mapping.registration.selection import (
+    draw_evenly,
+    draw_informative,
+    take_evenly_on_host,
+)
 
 
 def test_rows_are_drawn_evenly_and_without_those_that_are_no_returns():
@@ -55,3 +60,17 @@ def test_the_rows_that_tell_of_a_rare_direction_are_drawn():
     expected += 0.8 * leverage[rare].sum() / leverage.sum()
     assert abs(share - expected) < 0.02
     assert share > 0.1
+
+
+@pytest.mark.parametrize("count", [1, 50, 300, 1000])
+@pytest.mark.parametrize("finite", [0.0, 0.4, 1.0])
+def test_the_host_draws_the_rows_that_the_device_draws(count, finite):
+    rng = np.random.default_rng(count)
+    cloud = rng.normal(size=(300, 3)).astype(np.float32)
+    some = rng.uniform(size=300) < finite
+    cloud[~some] = np.nan
+    expected, is_row = draw_evenly(cloud, count)
+    found = take_evenly_on_host(cloud, some, count)
+    drawn = np.asarray(expected)[np.asarray(is_row)]
+    np.testing.assert_array_equal(found[: len(drawn)], drawn)
+    assert np.isnan(found[len(drawn) :]).all()

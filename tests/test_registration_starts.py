@@ -41,11 +41,14 @@ def search(monkeypatch, losses, starts, reach_m=0.7):
         ratio = jnp.sqrt(loss / (1 - loss)) * equations.INLIER_DEVIATIONS
         one, flag = jnp.ones(8), jnp.ones(8, bool)
         world = jnp.zeros((8, 3)) + 0 * scale_m
-        return equations.Residuals(ratio * one, jnp.zeros((8, 6)), one, flag, ~flag, one, world)
+        return equations.Residuals(
+            ratio * one, jnp.zeros((8, 6)), one, flag, ~flag, one, world, 0 * one
+        )
 
-    monkeypatch.setattr(solving, "compare", compare)
+    sum_returns = lambda *arguments: equations.sums_of(compare(*arguments))  # noqa: E731
+    monkeypatch.setattr(solving, "sum_returns", sum_returns)
     anchor = equations.Anchor(jnp.eye(4), None)
-    pose = solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, reach_m, starts)
+    pose, _ = solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, reach_m, starts)
     jax.effects_barrier()
     return np.asarray(pose)
 
@@ -79,8 +82,8 @@ def fit(on_surface, in_free_space, distance=0.0):
     flags = [jnp.asarray(each, bool) for each in (on_surface, in_free_space)]
     count = len(on_surface)
     one, zeros = jnp.ones(count), jnp.zeros((count, 6))
-    residuals = equations.Residuals(distance * one, zeros, one, *flags, one, zeros[:, :3])
-    return equations.fit_of(residuals, jnp.ones(count, bool))
+    residuals = equations.Residuals(distance * one, zeros, one, *flags, one, zeros[:, :3], 0 * one)
+    return equations.fit_of(equations.sums_of(residuals), jnp.ones(count, bool))
 
 
 def test_returns_in_free_space_are_lost():
@@ -116,9 +119,10 @@ def test_few_returns_that_fit_are_not_enough_to_stop(monkeypatch, begun):
     def compare(_, rows, pose, scale_m):
         zero, flag = jnp.zeros(8) + 0 * scale_m + 0 * pose[0, 3], jnp.arange(8) < 2
         none, world = jnp.zeros(8, bool), jnp.zeros((8, 3))
-        return equations.Residuals(zero, jnp.zeros((8, 6)), zero + 1, flag, none, zero, world)
+        return equations.Residuals(zero, jnp.zeros((8, 6)), zero + 1, flag, none, zero, world, zero)
 
-    monkeypatch.setattr(solving, "compare", compare)
+    sum_returns = lambda *arguments: equations.sums_of(compare(*arguments))  # noqa: E731
+    monkeypatch.setattr(solving, "sum_returns", sum_returns)
     anchor = equations.Anchor(jnp.eye(4), None)
     solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, 0.7, 3)
     jax.effects_barrier()
@@ -177,7 +181,7 @@ def test_starts_that_each_function_asks_for(monkeypatch, empty_map, call, expect
 
     def note(field, rows, pose, anchor, reach_m, starts):
         asked.append(int(starts))
-        return pose
+        return pose, rows.share
 
     monkeypatch.setattr(refining, "solve_coarse", note)
     cloud, pose = room_cloud(0)
@@ -190,7 +194,7 @@ def test_places_are_found_from_one_start_each_and_are_differentiable(monkeypatch
 
     def note(field, rows, pose, anchor, reach_m, starts):
         asked.append(int(starts))
-        return pose
+        return pose, rows.share
 
     def height(cloud, state):
         return hio.relocalize(state, cloud, jax.random.key(0), hypotheses=256).best.pose[2, 3]

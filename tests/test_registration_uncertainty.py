@@ -28,6 +28,7 @@ def residuals_of(seed, free=0):
         *(jnp.asarray(part, jnp.float32 if part.dtype == float else None) for part in parts),
         weight=jnp.asarray(weight, jnp.float32),
         points_world=jnp.asarray(points, jnp.float32),
+        width=jnp.zeros(COUNT),
     )
 
 

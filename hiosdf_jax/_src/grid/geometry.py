@@ -8,7 +8,7 @@ grown map answers bit by bit as before.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.barriers import differentiate_once
-from hiosdf_jax._src.numerics.vectors import Vector, each, split
+from hiosdf_jax._src.numerics.vectors import Vector, each
 
 type Start = tuple[jax.Array | np.int32, ...]
 """First voxel of a window: an int32 scalar for each axis, a constant where only one fits."""
@@ -37,12 +37,36 @@ def voxel_of(config: Config, points_world: jax.Array) -> tuple[jax.Array, jax.Ar
     points = points_world / config.voxel_size  # voxels
     corner = jnp.asarray(config.corner_index, points.dtype)
     shape = jnp.asarray(config.grid_shape, points.dtype)
+    cell, inside = _nearest_cell(points, corner, shape)
+    offset = points - (cell + corner) - 0.5
+    return jnp.nan_to_num(cell).astype(jnp.int32), offset, jnp.all(inside, axis=-1)
+
+
+def voxel_around(config: Config, point: Vector) -> tuple[Vector, jax.Array]:
+    """Finds the voxels that contain finite points, as `voxel_of` does.
+
+    Args:
+        config: The map's configuration.
+        point: (...) m each.
+
+    Returns:
+        Voxel indices, (...) int32 each, of the nearest voxel for points outside; and whether the
+        point is inside the grid, (...) bool.
+    """
+
+    def along(p: jax.Array, first: int, count: int) -> tuple[jax.Array, jax.Array]:
+        return _nearest_cell(p / config.voxel_size, first, count)
+
+    x, y, z = map(along, point, config.corner_index, config.grid_shape)
+    index = each(lambda cell: cell.astype(jnp.int32), (x[0], y[0], z[0]))
+    return index, x[1] & y[1] & z[1]
+
+
+def _nearest_cell(points: jax.Array, corner: Any, shape: Any) -> tuple[jax.Array, jax.Array]:
+    """Finds cells of a grid, and whether the points, in voxels, are inside it along each axis."""
     # Compared as floats: a far point would overflow an int32.
     cell = jnp.floor(points) - corner
-    inside = jnp.all((cell >= 0) & (cell < shape), axis=-1)
-    cell = jnp.clip(cell, 0, shape - 1)
-    offset = points - (cell + corner) - 0.5
-    return jnp.nan_to_num(cell).astype(jnp.int32), offset, inside
+    return jnp.clip(cell, 0, shape - 1), (cell >= 0) & (cell < shape)
 
 
 def voxel_of_window(
@@ -75,8 +99,12 @@ def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     Returns:
         (..., 3) m, world frame.
     """
-    index_world = index + jnp.asarray(config.corner_index, jnp.int32)
-    return (index_world.astype(jnp.float32) + 0.5) * config.voxel_size
+    return center_along(config, index, jnp.asarray(config.corner_index, jnp.int32))
+
+
+def center_along(config: Config, index: jax.Array, corner: Any) -> jax.Array:
+    """Computes a coordinate of voxels' centers from their indices and `corner_index` there, m."""
+    return ((index + corner).astype(jnp.float32) + 0.5) * config.voxel_size
 
 
 def window_centers(config: Config, start: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -106,57 +134,56 @@ class Corners(NamedTuple):
     The eight come first: a CPU cannot use its vector instructions for sums over a short last axis.
 
     Attributes:
+        lowest: Indices of the lowest of the eight along all axes, (...) int32 each.
         index: Voxel indices, (8, ...) int32 each; at the border some lie beyond the grid.
         flat: Indices into the raveled grid, (8, ...) int32; the nearest voxel for those beyond.
         inside: The voxel lies in the grid, (8, ...) bool.
         weight: (8, ...), adding up to 1.
     """
 
+    lowest: Vector
     index: Vector
     flat: jax.Array
     inside: jax.Array
     weight: jax.Array
 
 
-# For each axis, whether a corner is the upper one along it.
-_UPPER = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32).T
-
-
-def corners_of(config: Config, points_world: jax.Array) -> Corners:
+def corners_of(config: Config, point: Vector) -> Corners:
     """Finds the eight voxels whose centers surround points.
 
     Args:
         config: The map's configuration.
-        points_world: (..., 3) m, finite, inside the bounds.
+        point: (...) m each, finite, inside the bounds.
 
     Returns:
-        The corners; the first is the lowest along all axes.
+        The corners.
     """
+    point = differentiate_once(each(lambda p: p / config.voxel_size - 0.5, point))
+    number = jax.lax.broadcasted_iota(jnp.int32, (8, *[1] * point[0].ndim), 0)
 
-    def along(points: jax.Array, first: int, upper: np.ndarray) -> tuple[jax.Array, jax.Array]:
-        base = jnp.floor(points)
-        fraction = points - base
-        upper = upper.reshape(8, *[1] * points.ndim)
-        index = (base.astype(jnp.int32) - first) + upper
-        return index, jnp.where(upper == 1, fraction, 1 - fraction)
-
-    points = differentiate_once(split(points_world / config.voxel_size - 0.5))
-    parts = [along(*axis) for axis in zip(points, config.corner_index, _UPPER, strict=True)]
-    index = (parts[0][0], parts[1][0], parts[2][0])
+    upper = each(lambda bit: (number >> bit) & 1, (2, 1, 0))
+    base = each(jnp.floor, point)
+    lowest = each(lambda b, first: b.astype(jnp.int32) - first, base, config.corner_index)
+    index = each(jnp.add, lowest, upper)
     nearest = each(lambda i, n: jnp.clip(i, 0, n - 1), index, config.grid_shape)
     x, y, z = each(jnp.equal, index, nearest)
-    weight = parts[0][1] * parts[1][1] * parts[2][1]
-    return Corners(index, flat_index(config.grid_shape, nearest), x & y & z, weight)
+
+    def share(p: jax.Array, base: jax.Array, upper: jax.Array) -> jax.Array:
+        fraction = p - base
+        return jnp.where(upper == 1, fraction, 1 - fraction)
+
+    shares = each(share, point, base, upper)
+    flat = flat_index(config.grid_shape, nearest)
+    return Corners(lowest, index, flat, x & y & z, shares[0] * shares[1] * shares[2])
 
 
-def clamp(config: Config, points_world: jax.Array) -> jax.Array:
-    """Clamps (..., 3) points, m, to the bounds."""
-    low, high = jnp.asarray(config.bounds, points_world.dtype)
-    return clip_to_box(points_world, low, high)
+def clamp(config: Config, point: Vector) -> Vector:
+    """Clamps points, (...) m each, to the bounds."""
+    return each(clip_to_box, point, *(map(np.float32, corner) for corner in config.bounds))
 
 
-def clip_to_box(points: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Clamps (..., 3) points to a box, with the whole gradient on its faces.
+def clip_to_box(points: jax.Array, low: Any, high: Any) -> jax.Array:
+    """Clamps points, or one of their components, to a box, with the whole gradient on its faces.
 
     (`jnp.clip` halves the gradient there.)
     """

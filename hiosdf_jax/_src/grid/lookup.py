@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.numerics.barriers import compute_once, differentiate_once
+from hiosdf_jax._src.numerics.point_kernel import by_points
 from hiosdf_jax._src.numerics.vectors import (
     Vector,
     cross,
@@ -84,17 +85,22 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     Returns:
         The mean of the nearest patches. Differentiable by the points.
     """
-    points_world = geometry.clamp(config, points_world)
-    corners = geometry.corners_of(config, points_world)
-    patch = _patches_at(config, surface, corners, points_world)
+    return by_points(nearest_patch_at, config, surface, points_world)
+
+
+def nearest_patch_at(config: Config, surface: Surface, point: Vector) -> Nearest:
+    """Computes `nearest_patch` at points, (...) m each."""
+    point = geometry.clamp(config, point)
+    corners = geometry.corners_of(config, point)
+    patch = _patches_at(config, surface, corners, point)
     found, distance = patch.found, patch.distance
-    any_found = jnp.any(found, axis=0)
 
     side = surface.derived.side.ravel()[corners.flat]
-    value = _signed(patch, side, _space_at(config, surface.derived, corners, side, points_world))
+    value = _signed(patch, side, _space_at(config, surface.derived, corners, side, point))
 
     # It cancels from the mean, and so does its derivative.
     least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)
+    any_found = least < jnp.inf
     # Not by a minimum: at the nearest patch it would halve the derivative.
     nearness = jnp.exp(jnp.where(found, least - distance, 0) / _SOFT_VOXELS)
     weight = jnp.where(found, jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness, 0)
@@ -108,23 +114,23 @@ class Plane(NamedTuple):
     """The planes of the patches near points.
 
     Attributes:
-        height: Height of the point above the plane, on the sensor's side, (N,) m.
-        normal: Unit vectors, (N, 3).
-        beside: How far the point is from the patches' middle along the plane, (N,) m.
-        width: The patches' standard deviation along their shorter side, (N,) m.
-        spread: As in `Nearest`, (N,) m.
-        away: Distance to the nearest patch, (N,) m; inf where none is within the horizon.
+        height: Height of the point above the plane, on the sensor's side, (...) m.
+        normal: Unit vectors, (...) each.
+        beside: How far the point is from the patches' middle along the plane, (...) m.
+        width: The patches' standard deviation along their shorter side, (...) m.
+        spread: As in `Nearest`, (...) m.
+        away: Distance to the nearest patch, (...) m; inf where none is within the horizon.
     """
 
     height: jax.Array
-    normal: jax.Array
+    normal: Vector
     beside: jax.Array
     width: jax.Array
     spread: jax.Array
     away: jax.Array
 
 
-def nearest_plane(config: Config, surface: Surface, points_world: jax.Array) -> Plane:
+def nearest_plane_at(config: Config, surface: Surface, point: Vector) -> Plane:
     """Finds the mean plane of the patches near points, to register clouds.
 
     The normal of a patch that was hit a few times is noise. The mean of eight is less so, and
@@ -133,17 +139,19 @@ def nearest_plane(config: Config, surface: Surface, points_world: jax.Array) -> 
     Args:
         config: The map's configuration.
         surface: The grid's surface.
-        points_world: (N, 3) m; points outside the bounds take the border's value.
+        point: (...) m each; points outside the bounds take the border's value.
 
     Returns:
         The planes. Differentiable by the points and the patches, with the patches' weights fixed.
     """
-    points_world = geometry.clamp(config, points_world)
-    corners = geometry.corners_of(config, points_world)
-    patch = _patches_at(config, surface, corners, points_world)
+    point = geometry.clamp(config, point)
+    corners = geometry.corners_of(config, point)
+    patch = _patches_at(config, surface, corners, point)
     away = jnp.where(patch.found, patch.distance, jnp.inf)
-    nearest = jnp.argmin(away, axis=0)[None]
-    along = dot(patch.normal, each(lambda n: jnp.take_along_axis(n, nearest, 0), patch.normal))
+    number = jax.lax.broadcasted_iota(jnp.int32, away.shape, 0)
+    nearest = number == jnp.argmin(away, axis=0)[None]
+    nearest_normal = each(lambda n: jnp.sum(jnp.where(nearest, n, 0), axis=0), patch.normal)
+    along = dot(patch.normal, each(lambda n: n[None], nearest_normal))
     nearness = jnp.exp(jnp.minimum(jnp.min(away, axis=0) - patch.distance, 0) / _PLANE_VOXELS)
     weight = jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness * patch.area
     weight = jnp.where(patch.found & (along > _PLANE_COSINE), weight, 0)
@@ -159,7 +167,7 @@ def nearest_plane(config: Config, surface: Surface, points_world: jax.Array) -> 
     voxel = config.voxel_size
     return Plane(
         height=voxel * height,
-        normal=join(normal),
+        normal=normal,
         beside=voxel * beside,
         width=voxel * mean(patch.width),
         spread=voxel * mean(patch.spread),
@@ -197,8 +205,9 @@ def move_to_surface(
     Returns:
         The points on the surface; points without such patches stay as they are.
     """
-    corners = geometry.corners_of(config, points_world)
-    patch = _patches_at(config, surface, corners, points_world)
+    point = split(points_world)
+    corners = geometry.corners_of(config, point)
+    patch = _patches_at(config, surface, corners, point)
     cosine = dot(patch.normal, each(lambda n: n[None], split(normals)))
     near = patch.found & (patch.distance < _MOVED_VOXELS) & (jnp.abs(cosine) > _MOVED_COSINE)
     nearness = jnp.exp(-patch.distance / _MOVED_SOFT_VOXELS)
@@ -230,16 +239,19 @@ class _Patches(NamedTuple):
 
 
 def _patches_at(
-    config: Config, surface: Surface, corners: geometry.Corners, points_world: jax.Array
+    config: Config, surface: Surface, corners: geometry.Corners, point_world: Vector
 ) -> _Patches:
     """Computes distances of points from the patches that the voxels around them know."""
     jump = take(surface.derived.nearest.reshape(-1, 3), corners.flat)
     corners, jump = compute_once((corners, jump))
     found = corners.inside & (jump[0] != NO_FEATURE)
     # Relative to one voxel's center, so that large coordinates lose no digits.
-    first = each(lambda i: i[0], corners.index)
-    first_world = geometry.voxel_center(config, join(first))
-    point = differentiate_once(split((points_world - first_world) / config.voxel_size))
+    first = corners.lowest
+
+    def relative(point_m: jax.Array, first: jax.Array, corner: int) -> jax.Array:
+        return (point_m - geometry.center_along(config, first, corner)) / config.voxel_size
+
+    point = differentiate_once(each(relative, point_world, first, config.corner_index))
     sites = each(lambda i, j: jnp.where(found, i + j, 0), corners.index, jump)
     row = geometry.flat_index(config.grid_shape, sites)
     found, sites, row = compute_once((found, sites, row))
@@ -275,7 +287,7 @@ def _space_at(
     derived: Derived,
     corners: geometry.Corners,
     side: jax.Array,
-    points_world: jax.Array,
+    point: Vector,
 ) -> _Space:
     """Computes which shares of the space around points are free, and which lie behind surfaces.
 
@@ -285,8 +297,8 @@ def _space_at(
     into the room. In unseen space the voxel that contains the point decides: interpolated guesses
     would push waypoints deeper into new obstacles.
     """
-    index, _, _ = geometry.voxel_of(config, points_world)
-    own = geometry.flat_index(config.grid_shape, split(index))
+    index, _ = geometry.voxel_around(config, point)
+    own = geometry.flat_index(config.grid_shape, index)
     steps = derived.frontier_steps.ravel()
     own_side, observed = derived.side.ravel()[own], steps[own] > 0
     seen = corners.inside & (steps[corners.flat] > 0)
@@ -330,7 +342,11 @@ def grid_sdf(config: Config, surface: Surface, points_world: jax.Array) -> jax.A
     Returns:
         (...) m; the horizon where no patch is within it. Differentiable by the points.
     """
-    return nearest_patch(config, surface, points_world).sdf
+    return by_points(_grid_sdf_at, config, surface, points_world)
+
+
+def _grid_sdf_at(config: Config, surface: Surface, point: Vector) -> jax.Array:
+    return nearest_patch_at(config, surface, point).sdf
 
 
 def patch_voxel(config: Config, derived: Derived, index: Vector) -> jax.Array:
@@ -361,7 +377,11 @@ def doubt_distance(config: Config, surface: Surface, points_world: jax.Array) ->
     Returns:
         (...) m. Differentiable.
     """
-    corners = geometry.corners_of(config, points_world)
+    return by_points(_doubt_at, config, surface, points_world)
+
+
+def _doubt_at(config: Config, surface: Surface, point: Vector) -> jax.Array:
+    corners = geometry.corners_of(config, point)
     around = surface.derived.doubt.ravel()[corners.flat].astype(jnp.float32)
     # Beyond the bounds: the value of voxels that `grow` adds, so that it changes no old answer.
     around = jnp.where(corners.inside, around, config.distance_horizon)
@@ -379,12 +399,17 @@ def frontier_distance(config: Config, surface: Surface, points_world: jax.Array)
     Returns:
         (...) m; positive in observed voxels, negative in others. Differentiable.
     """
-    corners = geometry.corners_of(config, points_world)
+    return by_points(frontier_at, config, surface, points_world)
+
+
+def frontier_at(config: Config, surface: Surface, point: Vector) -> jax.Array:
+    """Computes `frontier_distance` at points, (...) m each."""
+    corners = geometry.corners_of(config, point)
     steps = surface.derived.frontier_steps.ravel()
     around = steps[corners.flat].astype(jnp.float32) * frontier_step_m(config)
     around = jnp.where(corners.inside, around, -config.frontier_horizon)
-    index, _, inside = geometry.voxel_of(config, points_world)
-    observed = inside & (steps[geometry.flat_index(config.grid_shape, split(index))] > 0)
+    index, inside = geometry.voxel_around(config, point)
+    observed = inside & (steps[geometry.flat_index(config.grid_shape, index)] > 0)
     # Voxels beyond the bounds know nothing, and voxels that `grow` added know nothing until the
     # next update. Next to an observed voxel, unseen space begins half a voxel before the unobserved
     # center. Elsewhere they count as deep as the deepest voxel that knows.

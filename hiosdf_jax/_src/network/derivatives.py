@@ -11,6 +11,7 @@ from jax.custom_batching import custom_vmap
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.network import evaluation, forward, loss
+from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.samples.draw import Samples
 
@@ -61,7 +62,7 @@ def _chosen(config: Config, by_xla: Any) -> Any:
 
     @custom_vmap
     def choose(*arguments: Any) -> Any:
-        return evaluation.choose_by_device(by_kernel, by_xla, *arguments)
+        return devices.choose(by_kernel, by_xla, evaluation.INTERPRET, *arguments)
 
     @choose.def_vmap
     @plain  # traced again when a caller batches it, in the caller's modes

@@ -15,14 +15,13 @@ from jax.custom_batching import custom_vmap
 
 from hiosdf_jax._src.network import forward
 from hiosdf_jax._src.network.tiles import LARGEST
+from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.tiles import map_tiles
 
-_HOPPER = "9.0"  # CUDA's compute capability
 _WIDTHS = (128, 256)
 _MOST_LAYERS = 8  # more biases than that do not fit into shared memory
 _LEAST_ROWS = 8192  # fewer gain little, and the kernel takes seconds to compile
-_TRIED_BEFORE = (0, 13)  # jax changes its interface for GPU kernels from version to version
 
 INTERPRET: Any = None  # the tests' way to run the kernel on a CPU
 
@@ -59,24 +58,12 @@ def value_and_gradient(
     return function(jnp.float32(frequency), params, points)
 
 
-def is_available() -> bool:
-    """Returns whether the default backend is one Hopper GPU, and jax a version that was tried.
-
-    XLA cannot divide a kernel of ours among several devices.
-    """
-    if jax.__version_info__ >= _TRIED_BEFORE:
-        return False
-    devices = jax.devices()
-    capability = getattr(devices[0], "compute_capability", None)
-    return len(devices) == 1 and jax.default_backend() == "gpu" and capability == _HOPPER
-
-
 def has_kernel(params: Any) -> bool:
     """Returns whether a network has a shape for the kernels, and the device is one for them."""
     layers = forward.layers_of(params)
     widths = {kernel.shape[1] for kernel, _ in layers[:-1]}
     fits = len(widths) == 1 and widths <= set(_WIDTHS) and 3 <= len(layers) <= _MOST_LAYERS + 2
-    return fits and is_available()
+    return fits and devices.has_kernels()
 
 
 def _value_by_xla(frequency: Any, params: Any, points: jax.Array) -> jax.Array:
@@ -106,14 +93,7 @@ def _choose(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
     points = arguments[-1]
     if points.size < 3 * _LEAST_ROWS:
         return by_xla(*arguments)
-    return choose_by_device(by_kernel, by_xla, *arguments)
-
-
-def choose_by_device(by_kernel: Any, by_xla: Any, *arguments: Any) -> Any:
-    """Runs a kernel on a Hopper GPU, else XLA. The device is known when the program is compiled."""
-    if INTERPRET is not None:
-        return by_kernel(*arguments)
-    return jax.lax.platform_dependent(*arguments, cuda=by_kernel, default=by_xla)
+    return devices.choose(by_kernel, by_xla, INTERPRET, *arguments)
 
 
 def batch_by_xla(by_xla: Any, batched: Any, arguments: Any) -> Any:

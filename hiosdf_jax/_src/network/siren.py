@@ -8,13 +8,13 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.network import evaluation
 from hiosdf_jax._src.network.fast_sine import sine
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.tangents import all_zero, instantiate
 
 
 class Siren(nn.Module):
@@ -76,10 +76,10 @@ def predict(config: Config, params: Any, points: jax.Array) -> jax.Array:
 @plain
 def _predict_jvp(config: Config, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     (params, points), (by_params, by_points) = primals, tangents
-    if not _all_zero(by_params):
-        return jax.jvp(network_of(config).apply, primals, _instantiate(primals, tangents))
+    if not all_zero(by_params):
+        return jax.jvp(network_of(config).apply, primals, instantiate(primals, tangents))
     value, gradient = predict_with_gradient(config, params, points)
-    return value, jnp.sum(gradient * _instantiate(points, by_points), axis=-1)
+    return value, jnp.sum(gradient * instantiate(points, by_points), axis=-1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -108,20 +108,6 @@ def _predict_with_gradient_jvp(config: Config, primals: Any, tangents: Any) -> A
         )
 
     return jax.jvp(plain, primals, tangents)
-
-
-def _all_zero(tangents: Any) -> bool:
-    return all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents))
-
-
-def _instantiate(primals: Any, tangents: Any) -> Any:
-    return jax.tree.map(
-        lambda primal, tangent: (
-            jnp.zeros_like(primal) if isinstance(tangent, SymbolicZero) else tangent
-        ),
-        primals,
-        tangents,
-    )
 
 
 def shift_output(config: Config, params: Any, amount: jax.Array) -> Any:

@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 from jax.custom_derivatives import SymbolicZero
+
+_barred = contextvars.ContextVar("_barred", default=True)
+
+
+@contextlib.contextmanager
+def no_barriers() -> Iterator[None]:
+    """Leaves barriers out of what is traced: in a kernel of ours, all is computed once."""
+    token = _barred.set(False)
+    try:
+        yield
+    finally:
+        _barred.reset(token)
 
 
 def compute_once(tree: Any) -> Any:
@@ -23,7 +38,7 @@ def compute_once(tree: Any) -> Any:
     """
     if jax.default_backend() != "cpu":
         return tree
-    return jax.lax.optimization_barrier(tree)
+    return _barrier(tree)
 
 
 def hold(tree: Any) -> Any:
@@ -39,7 +54,7 @@ def hold(tree: Any) -> Any:
     """
     if jax.default_backend() == "cpu":
         return tree
-    return jax.lax.optimization_barrier(tree)
+    return _barrier(tree)
 
 
 @jax.custom_jvp
@@ -62,6 +77,10 @@ def differentiate_once(tree: Any) -> Any:
 def _differentiate_once_jvp(primals: Any, tangents: Any) -> Any:
     leaves, structure = jax.tree.flatten(tangents[0])
     given = [not isinstance(leaf, SymbolicZero) for leaf in leaves]
-    kept = iter(jax.lax.optimization_barrier([t for t, g in zip(leaves, given, strict=True) if g]))
+    kept = iter(_barrier([t for t, g in zip(leaves, given, strict=True) if g]))
     held = [next(kept) if g else t for t, g in zip(leaves, given, strict=True)]
     return primals[0], jax.tree.unflatten(structure, held)
+
+
+def _barrier(tree: Any) -> Any:
+    return jax.lax.optimization_barrier(tree) if _barred.get() else tree

@@ -13,11 +13,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_batching import custom_vmap
-from jax.custom_derivatives import SymbolicZero
 
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.tangents import all_zero, instantiate
 from hiosdf_jax._src.numerics.tiles import map_tiles
 
 # Rows of a tile. From 1,024 to 8,192 are equally fast.
@@ -59,21 +58,10 @@ def by_rows(function: Evaluate, with_gradient: Evaluate | None = None) -> Evalua
     @functools.partial(evaluate.defjvp, symbolic_zeros=True)
     @plain
     def _(primals: Any, tangents: Any) -> Any:
-        if with_gradient is None or not all(map(_is_zero, jax.tree.leaves(tangents[0]))):
-            return jax.jvp(function, primals, jax.tree.map(_instantiate, primals, tangents))
+        tangents_all = instantiate(primals, tangents)
+        if with_gradient is None or not all_zero(tangents[0]):
+            return jax.jvp(function, primals, tangents_all)
         value, gradient = with_gradient(*primals)
-        return value, jnp.sum(gradient * _instantiate(primals[1], tangents[1]), axis=-1)
+        return value, jnp.sum(gradient * tangents_all[1], axis=-1)
 
     return evaluate
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, SymbolicZero) or tangent.dtype == jax.dtypes.float0
-
-
-def _instantiate(primal: Any, tangent: Any) -> Any:
-    if not _is_zero(tangent):
-        return tangent
-    if jnp.issubdtype(primal.dtype, jnp.inexact):
-        return jnp.zeros_like(primal)
-    return np.zeros(primal.shape, jax.dtypes.float0)

@@ -6,6 +6,9 @@ and several for one system of linear equations.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -38,18 +41,33 @@ def solve_positive(matrix: jax.Array, value: jax.Array) -> jax.Array:
     Returns:
         The solution, (..., K).
     """
-    size = value.shape[-1]
+    entries = [[matrix[..., i, j] for j in range(i + 1)] for i in range(value.shape[-1])]
+    parts = [value[..., i] for i in range(value.shape[-1])]
+    return jnp.stack(solve_entries(entries, parts), axis=-1)
+
+
+def solve_entries(matrix: Sequence[Sequence[Any]], value: Sequence[Any]) -> list[Any]:
+    """Solves linear equations whose numbers are arrays of their own; see `solve_positive`.
+
+    Args:
+        matrix: The lower half, row by row: K rows of 1 to K arrays (...).
+        value: The right side, K arrays (...).
+
+    Returns:
+        The solution, K arrays (...).
+    """
+    size = len(value)
     lower: dict[tuple[int, int], jax.Array] = {}
     scaled: dict[tuple[int, int], jax.Array] = {}  # lower[i, k] * pivot[k]
     inverse, x = [], []
     for j in range(size):
-        pivot = matrix[..., j, j] - sum(scaled[j, k] * lower[j, k] for k in range(j))
-        inverse.append(1 / jnp.maximum(pivot, _LEAST_PIVOT * matrix[..., j, j]))
+        pivot = matrix[j][j] - sum(scaled[j, k] * lower[j, k] for k in range(j))
+        inverse.append(1 / jnp.maximum(pivot, _LEAST_PIVOT * matrix[j][j]))
         for i in range(j + 1, size):
             rest = sum(scaled[i, k] * lower[j, k] for k in range(j))
-            scaled[i, j] = matrix[..., i, j] - rest
+            scaled[i, j] = matrix[i][j] - rest
             lower[i, j] = scaled[i, j] * inverse[j]
-        x.append(value[..., j] - sum(lower[j, k] * x[k] for k in range(j)))
+        x.append(value[j] - sum(lower[j, k] * x[k] for k in range(j)))
     for j in reversed(range(size)):
         x[j] = x[j] * inverse[j] - sum(lower[i, j] * x[i] for i in range(j + 1, size))
-    return jnp.stack(x, axis=-1)
+    return x

@@ -31,17 +31,20 @@ def each(function: Callable[..., jax.Array], *vectors: Any) -> Vector:
     return x, y, z
 
 
-def take(table: jax.Array, rows: jax.Array, first: int = 0) -> Vector:
+def take(table: Any, rows: jax.Array, first: int = 0) -> Vector:
     """Gathers vectors from the rows of a table (N, M), from column `first` on.
 
     Args:
-        table: Fewer than 2^31 numbers; floats become float32, integers int32.
+        table: Fewer than 2^31 numbers; floats become float32, integers int32. A table in a kernel
+            of ours, `point_kernel`, gathers in its own way.
         rows: Row indices, (...).
         first: Column of the first component.
 
     Returns:
         The components, (...) each.
     """
+    if not isinstance(table, jax.Array):
+        return table.take(rows, first)
     floats = jnp.issubdtype(table.dtype, jnp.floating)
     dtype = jnp.float32 if floats else jnp.int32
     # One index per number: a pair takes twice as long on a CPU. Unsigned: no check for negative

@@ -6,16 +6,30 @@ components of a motion have one unit, and directions can be compared.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from hiosdf_jax._src.mapping.registration.matching import between, match_points
-from hiosdf_jax._src.mapping.registration.motion import motion_between, move, offsets_from
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.mapping.registration.matching import (
+    Match,
+    between,
+    match_at,
+    match_baked,
+    share_of_map,
+)
+from hiosdf_jax._src.mapping.registration.motion import motion_between, move
 from hiosdf_jax._src.mapping.registration.selection import even_steps
-from hiosdf_jax._src.numerics.small_matrices import product, solve_positive
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.numerics import devices
+from hiosdf_jax._src.numerics.point_kernel import by_points, columns, joined, sum_by_points
+from hiosdf_jax._src.numerics.small_matrices import product, solve_entries, solve_positive
+from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each
+from hiosdf_jax._src.state import Baked, Field, Surface
 
 GROWING_REACH_M = 0.2
 """How far surfaces may be from where they should be, in a map that grows."""
@@ -59,6 +73,9 @@ _UNKNOWN_MORE = 0.1
 # Information of a free direction without a prior: a standard deviation of 100 m.
 _FREE_INFORMATION = 1e-4
 
+# Rows and columns of the lower half of a symmetric matrix (6, 6).
+_LOWER = [(i, j) for i in range(6) for j in range(i + 1)]
+
 # Enough for coarse steps, for principal directions, and to judge a pose.
 _EVEN_ROWS = 1024
 
@@ -79,6 +96,7 @@ class Rows(NamedTuple):
         some: The row is a return, (N,) bool.
         length: Typical range, () m: a rotation by 1 rad counts as this many meters.
         growing: How incomplete the map is, () from 0 to 1: a return may be of a new surface.
+        share: How far distances are the map's own, () from 0 to 1; see `matching.share_of_map`.
     """
 
     points: jax.Array
@@ -86,6 +104,7 @@ class Rows(NamedTuple):
     some: jax.Array
     length: jax.Array
     growing: jax.Array
+    share: jax.Array
 
 
 class Residuals(NamedTuple):
@@ -99,6 +118,7 @@ class Residuals(NamedTuple):
         contrary: The map has seen it empty, (N,) bool.
         weight: Inverse variance, less for outliers, 0 where nothing can be compared, (N,).
         points_world: (N, 3) m.
+        width: As in `matching.Match`, (N,) voxels.
     """
 
     distance: jax.Array
@@ -108,6 +128,7 @@ class Residuals(NamedTuple):
     contrary: jax.Array
     weight: jax.Array
     points_world: jax.Array
+    width: jax.Array
 
 
 class Anchor(NamedTuple):
@@ -155,7 +176,8 @@ def make_rows(
     mean = jnp.sum(jnp.where(some, square, 0)) / jnp.maximum(jnp.sum(some), 1)
     length = jnp.clip(jnp.sqrt(jnp.maximum(jax.lax.stop_gradient(mean), 1e-6)), *_RANGES_M)
     sigma = noise[0] + noise[1] * square
-    return Rows(points, sigma, some, length, jnp.asarray(growing, jnp.float32))
+    growing = jnp.asarray(growing, jnp.float32)
+    return Rows(points, sigma, some, length, growing, jnp.ones((), jnp.float32))
 
 
 def take_rows(rows: Rows, index: jax.Array | slice) -> Rows:
@@ -188,26 +210,165 @@ def compare(
     Returns:
         The residuals.
     """
-    offset = offsets_from(pose, rows.points)
-    points_world = offset + pose[:3, 3]
-    match = match_points(field, points_world, offset, rows.some, rows.growing)
+    arguments, numbers = _arguments(rows, pose, scale_m)
+    if isinstance(field, Field):
+        return by_points(_compare_at, field.config, field.surface, *arguments, numbers=numbers)
+
+    def match(point_world: Vector, *_: Any) -> Match:
+        return match_baked(field, point_world)
+
+    return joined(_residuals_at(match, columns(numbers), *map(columns, arguments)))
+
+
+def sum_returns(
+    field: Field | Baked, rows: Rows, pose: jax.Array, scale_m: jax.Array | float
+) -> Sums:
+    """Computes `sums_of` the residuals of `compare`.
+
+    One kernel does it on a Hopper GPU. Elsewhere the residuals are made first, so that each return
+    is looked up once.
+    """
+    if isinstance(field, Baked) or not devices.has_kernels():
+        return sums_of(compare(field, rows, pose, scale_m))
+    arguments, numbers = _arguments(rows, pose, scale_m)
+    return Sums(sum_by_points(_terms_at, field.config, field.surface, *arguments, numbers=numbers))
+
+
+def _arguments(
+    rows: Rows, pose: jax.Array, scale_m: jax.Array | float
+) -> tuple[tuple[jax.Array, ...], jax.Array]:
+    """Returns what `_residuals_at` takes: arrays of rows (N, K), and numbers."""
+    scalars = jnp.stack([jnp.float32(scale_m), rows.share, rows.growing, rows.length])
+    returns = rows.points, rows.sigma[:, None], rows.some[:, None]
+    return returns, jnp.concatenate([pose[:3].ravel(), scalars])
+
+
+def _compare_at(config: Config, surface: Surface, *arguments: Any) -> Any:
+    return _residuals_at(partial(match_at, config, surface), *arguments)
+
+
+def _terms_at(config: Config, surface: Surface, *arguments: Any) -> tuple[jax.Array, ...]:
+    """Computes what each return adds to the sums."""
+    found = _compare_at(config, surface, *arguments)
+    weighted = [found.weight * part for part in found.jacobian]
+    information = [weighted[i] * found.jacobian[j] for i, j in _LOWER]
+    slope = [part * found.distance for part in weighted]
+    others = [part.astype(jnp.float32) for part in _others_of(found)]
+    return (*information, *slope, *others)
+
+
+def _residuals_at(
+    match: Callable[..., Match], numbers: Any, point: Any, sigma: Any, some: Any
+) -> Any:
+    """Computes `compare` for returns whose columns are given, and columns instead of arrays.
+
+    Args:
+        match: `match_at` of a map.
+        numbers: The rows of the pose, the scale, m, and three attributes of `Rows`.
+        point: (...) m each, sensor frame.
+        sigma: As in `Rows`, a tuple of one array (...).
+        some: As in `Rows`, a tuple of one array (...).
+
+    Returns:
+        The residuals.
+    """
+    turn, (scale_m, share, growing, length) = numbers[:12], numbers[12:]
+    offset = each(lambda row: dot(turn[row : row + 3], point), (0, 4, 8))
+    point_world = each(jnp.add, offset, turn[3::4])
+    found = match(point_world, offset, growing, share)
     # Only the part of the error along the normal counts.
-    square = jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-6)
-    along = jnp.minimum(jnp.sum(match.normal * offset, axis=-1) ** 2 / square, 1)
-    variance = along * rows.sigma**2 + (1 - along) * _ACROSS_RAD**2 * square
-    variance += match.spread**2 + _LEAST_SIGMA_M**2
-    comparable = rows.some & match.usable
+    square = jnp.maximum(dot(offset, offset), 1e-6)
+    along = jnp.minimum(dot(found.normal, offset) ** 2 / square, 1)
+    variance = along * sigma[0] ** 2 + (1 - along) * _ACROSS_RAD**2 * square
+    variance += found.spread**2 + _LEAST_SIGMA_M**2
     deepest = jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - GROWING_REACH_M))
-    comparable &= match.depth < deepest
-    deviations = between(_OUTLIER_DEVIATIONS, rows.growing)
-    sigma = jnp.sqrt(variance + (scale_m / deviations) ** 2)
+    comparable = some[0] & found.usable & (found.depth < deepest)
+    deviations = between(_OUTLIER_DEVIATIONS, growing)
+    whole = jnp.sqrt(variance + (scale_m / deviations) ** 2)
     # The function of Geman and McClure.
-    ratio = match.distance / (deviations * sigma)
-    weight = jnp.where(comparable, 1 / (sigma * (1 + ratio**2)) ** 2, 0)
-    turn = jnp.cross(offset, match.normal) / rows.length
-    jacobian = jnp.concatenate([match.normal, turn], axis=-1)
-    contrary = rows.some & match.empty
-    return Residuals(match.distance, jacobian, sigma, comparable, contrary, weight, points_world)
+    ratio = found.distance / (deviations * whole)
+    weight = jnp.where(comparable, 1 / (whole * (1 + ratio**2)) ** 2, 0)
+    lever = each(lambda part: part / length, cross(offset, found.normal))
+    jacobian: Any = (*found.normal, *lever)
+    points_world: Any = point_world
+    return Residuals(
+        distance=found.distance,
+        jacobian=jacobian,
+        sigma=whole,
+        comparable=comparable,
+        contrary=some[0] & found.empty,
+        weight=weight,
+        points_world=points_world,
+        width=jnp.where(some[0], found.width, 0),
+    )
+
+
+class Sums(NamedTuple):
+    """What steps need of all returns together.
+
+    Attributes:
+        values: All sums in one array, (31,), so that one copy moves them.
+    """
+
+    values: jax.Array
+
+    @property
+    def information(self) -> jax.Array:
+        """Lower half of the information matrix, row by row, (21,) 1/m^2."""
+        return self.values[:21]
+
+    @property
+    def slope(self) -> jax.Array:
+        """Slope of half the weighted sum of squares by the motion, (6,) 1/m."""
+        return self.values[21:27]
+
+    @property
+    def loss(self) -> jax.Array:
+        """Sum of the losses of the returns about which the map tells something, ()."""
+        return self.values[27]
+
+    @property
+    def known(self) -> jax.Array:
+        """Number of the returns about which the map tells something, ()."""
+        return self.values[28]
+
+    @property
+    def share(self) -> jax.Array:
+        """How far distances are the map's own at this pose; see `matching.share_of_map`."""
+        return share_of_map(self.values[29], self.values[30])
+
+
+def sums_of(residuals: Residuals) -> Sums:
+    """Sums residuals over the returns."""
+    information, slope = normal_equations(residuals)
+    rows, lower = zip(*_LOWER, strict=True)
+    others = _others_of(residuals)
+    return Sums(
+        jnp.concatenate(
+            [
+                information[np.array(rows), np.array(lower)],
+                slope,
+                jnp.stack([jnp.sum(part.astype(jnp.float32)) for part in others]),
+            ]
+        )
+    )
+
+
+def no_sums() -> Sums:
+    """Returns the sums of no returns."""
+    return Sums(jnp.zeros(31, jnp.float32))
+
+
+def _others_of(residuals: Residuals) -> tuple[jax.Array, ...]:
+    """Returns what `Sums` sums after the slope, (N,) each."""
+    known = residuals.comparable | residuals.contrary
+    return _loss_of(residuals), known, residuals.width, residuals.width > 0
+
+
+def _whole(lower: jax.Array) -> jax.Array:
+    """Makes a symmetric matrix (6, 6) of its lower half (21,)."""
+    place = {pair: number for number, pair in enumerate(_LOWER)}
+    return lower[np.array([[place[max(i, j), min(i, j)] for j in range(6)] for i in range(6)])]
 
 
 def normal_equations(residuals: Residuals) -> tuple[jax.Array, jax.Array]:
@@ -274,7 +435,9 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
         return jnp.sum(more) / jnp.maximum(jnp.sum(both), 1)
 
     way = _TRIED_M * basis.T[:_TRIED_DIRECTIONS] / units(rows)
-    grown = jax.lax.map(growth, jnp.concatenate([way, -way])).reshape(2, -1)
+    # All at once would need much memory where XLA makes arrays of all that leads to the losses.
+    each_way = jax.vmap if devices.has_kernels() else partial(partial, jax.lax.map)
+    grown = each_way(growth)(jnp.concatenate([way, -way])).reshape(2, -1)
     least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
     free = ~(jnp.min(grown, axis=0) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
@@ -285,6 +448,11 @@ def _loss(residuals: Residuals) -> jax.Array:
     """The loss of Geman and McClure, (N,), from 0 to 1."""
     square = (residuals.distance / (INLIER_DEVIATIONS * residuals.sigma)) ** 2
     return square / (1 + square)
+
+
+def _loss_of(residuals: Residuals) -> jax.Array:
+    """The losses of returns in a fit, (N,): 1 for one that contradicts the map."""
+    return jnp.where(residuals.comparable, _loss(residuals), jnp.where(residuals.contrary, 1.0, 0))
 
 
 class Fit(NamedTuple):
@@ -300,15 +468,12 @@ class Fit(NamedTuple):
     known: jax.Array
 
 
-def fit_of(residuals: Residuals, some: jax.Array) -> Fit:
+def fit_of(sums: Sums, some: jax.Array) -> Fit:
     """Computes how badly returns (N,) fit."""
-    loss = jnp.where(residuals.comparable, _loss(residuals), 0)
-    contrary = residuals.contrary & ~residuals.comparable
-    total = jnp.sum(loss) + jnp.sum(contrary)
-    known, count = jnp.sum(residuals.comparable | contrary), jnp.sum(some)
-    enough = known >= jnp.maximum(LEAST_COMPARABLE * count, 1)
-    mean = jnp.where(enough, total / jnp.maximum(known, 1), jnp.inf)
-    return Fit(mean, known / jnp.maximum(count, 1).astype(jnp.float32))
+    count = jnp.sum(some)
+    enough = sums.known >= jnp.maximum(LEAST_COMPARABLE * count, 1)
+    mean = jnp.where(enough, sums.loss / jnp.maximum(sums.known, 1), jnp.inf)
+    return Fit(mean, sums.known / jnp.maximum(count, 1).astype(jnp.float32))
 
 
 def fits_better(one: Fit, other: Fit) -> jax.Array:
@@ -366,7 +531,7 @@ def stiffness(information: jax.Array, directions: Directions | None, anchor: Anc
 
 
 def find_step(
-    residuals: Residuals,
+    sums: Sums,
     directions: Directions | None,
     anchor: Anchor,
     rows: Rows,
@@ -377,7 +542,7 @@ def find_step(
     """Computes the Gauss-Newton step.
 
     Args:
-        residuals: The returns at the pose.
+        sums: The returns at the pose, summed.
         directions: As for `balance`.
         anchor: As for `balance`.
         rows: As for `balance`.
@@ -388,14 +553,26 @@ def find_step(
     Returns:
         The motion, (6,) m and rad.
     """
-    information, slope = (part / inflation for part in normal_equations(residuals))
+    if directions is None and anchor.information is None:
+        length = rows.length[None]
+        return by_points(_free_step_at, damping, (), sums.values[None], numbers=length, least=1)[0]
+    information = _whole(sums.information) / inflation
     information += damping * jnp.trace(information) / 6 * jnp.eye(6, dtype=jnp.float32)
     matrix = stiffness(information, directions, anchor)
-    wanted = balance(directions, slope, anchor, rows, pose)
+    wanted = balance(directions, sums.slope / inflation, anchor, rows, pose)
     step = solve_positive(matrix, wanted)
     if directions is not None:
         step = product(directions.basis, step)
     return -step / units(rows)
+
+
+def _free_step_at(damping: float, tables: Any, length: Any, sums: Any) -> tuple[jax.Array, ...]:
+    """Computes a step along the axes that nothing but the returns holds, (...) each."""
+    lower = dict(zip(_LOWER, sums, strict=False))
+    more = damping / 6 * functools.reduce(jnp.add, [lower[i, i] for i in range(6)])
+    matrix = [[lower[i, j] + (more if i == j else 0) for j in range(i + 1)] for i in range(6)]
+    step = solve_entries(matrix, sums[21:27])
+    return (*(-part for part in step[:3]), *(-part / length[0] for part in step[3:]))
 
 
 def invert(matrix: jax.Array) -> jax.Array:

@@ -1,4 +1,7 @@
-"""What the map says of the returns of a cloud: distance, normal, spread, observed or not."""
+"""What the map says of the returns of a cloud: distance, normal, spread, observed or not.
+
+Functions of points take and return vectors as three arrays, so that one kernel can compute them.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,8 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.field.queries import query
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.mapping.registration.motion import offsets_from
-from hiosdf_jax._src.numerics.vectors import split
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, split
+from hiosdf_jax._src.state import Baked, Field, Surface
 
 # A gradient that is shorter than this lies between surfaces and has no direction.
 _LEAST_SLOPE = 0.5
@@ -54,95 +57,107 @@ class Match(NamedTuple):
     """Points compared with a map.
 
     Attributes:
-        distance: Signed distance from the surface, (N,) m.
-        normal: Its gradient, (N, 3).
-        spread: Standard deviation of the surface there, (N,) m.
-        depth: How far the point lies in unseen space, (N,) m; negative in observed space.
-        usable: The map has a surface near the point, (N,) bool.
-        empty: The map has seen the place, and no surface there, (N,) bool.
+        distance: Signed distance from the surface, (...) m.
+        normal: Its gradient, (...) each.
+        spread: Standard deviation of the surface there, (...) m.
+        depth: How far the point lies in unseen space, (...) m; negative in observed space.
+        usable: The map has a surface near the point, (...) bool.
+        empty: The map has seen the place, and no surface there, (...) bool.
+        width: Width of the patches near the point, (...) voxels; 0 where there is none to compare,
+            and for a baked field.
     """
 
     distance: jax.Array
-    normal: jax.Array
+    normal: Vector
     spread: jax.Array
     depth: jax.Array
     usable: jax.Array
     empty: jax.Array
+    width: jax.Array
 
 
-def match_points(
-    field: Field | Baked,
-    points_world: jax.Array,
-    offset: jax.Array,
-    some: jax.Array,
-    growing: jax.Array | float,
+def match_at(
+    config: Config,
+    surface: Surface,
+    point_world: Vector,
+    offset: Vector,
+    growing: jax.Array,
+    share: jax.Array,
 ) -> Match:
-    """Compares points with a map.
-
-    A live map answers by its grid alone: the network changes no surface and costs more.
+    """Compares points with a map by its grid alone: the network changes no surface and costs more.
 
     Args:
-        field: The map.
-        points_world: (N, 3) m, finite.
-        offset: The same relative to the sensor, (N, 3) m.
-        some: The row is a point, (N,) bool.
-        growing: How incomplete the map is, () from 0 to 1.
+        config: The map's configuration.
+        surface: The grid's surface.
+        point_world: (...) m each, finite.
+        offset: The same relative to the sensor, (...) m each.
+        growing: How incomplete the map is, from 0 to 1.
+        share: How far distances are the map's own; see `share_of_map`.
 
     Returns:
         The comparison. Differentiable by the points.
     """
-    if isinstance(field, Baked):
-        answer = query(field, points_world)
-        distance, normal, depth = answer.sdf, answer.grad, -answer.frontier
-        spread = jnp.full(distance.shape, _BAKED_SPREAD) * field.resolution
-        # `bake` takes half a cell's diagonal off the frontier.
-        depth = depth - 3**0.5 / 2 * field.resolution
-        inside = jnp.ones(distance.shape, bool)
-        empty = jnp.zeros(distance.shape, bool)  # all points are usable
-    else:
-        config, surface = field.config, field.surface
 
-        def nearest(points: jax.Array) -> tuple[jax.Array, jax.Array]:
-            found = lookup.nearest_patch(config, surface, points)
-            return found.sdf, found.spread
+    def nearest_at(point: Vector) -> tuple[jax.Array, lookup.Nearest]:
+        nearest = lookup.nearest_patch_at(config, surface, point)
+        return nearest.sdf, nearest
 
-        distance, pull, spread = jax.vjp(nearest, points_world, has_aux=True)
-        (normal,) = pull(jnp.ones_like(distance))
-        plane = lookup.nearest_plane(config, surface, points_world)
-        depth = -lookup.frontier_distance(config, surface, geometry.clamp(config, points_world))
-        inside = jnp.all(points_world == geometry.clamp(config, points_world), axis=-1)
-        free = depth < -_FREE_VOXELS * config.voxel_size
-        empty = inside & free & (plane.away > _EMPTY_VOXELS * config.voxel_size)
-        beside, width = plane.beside / config.voxel_size, plane.width / config.voxel_size
-        inside &= (beside < _MOST_BESIDE_VOXELS[0]) & (width > _LEAST_WIDTH_VOXELS[0])
-        share = _share_of_map(width, some & inside)
-        # Where most patches are narrow, none can be left out.
-        strict = share * growing
-        inside &= beside < between(_MOST_BESIDE_VOXELS, strict)
-        inside &= width > between(_LEAST_WIDTH_VOXELS, strict)
-        # A sheet's distance grows on both sides, the height above its plane on one.
-        side = jnp.where(jnp.sum(normal * plane.normal, axis=-1) < 0, -1, 1)
-        distance = share * distance + (1 - share) * side * plane.height
-        normal = share * normal + (1 - share) * side[:, None] * plane.normal
-        spread = share * spread + (1 - share) * plane.spread
-        inside &= ~_is_back(field, points_world, offset, normal)
-    steep = jnp.sum(normal**2, axis=-1) > _LEAST_SLOPE**2
-    return Match(distance, normal, spread, depth, inside & steep, empty)
+    size = config.voxel_size
+    _, pull, nearest = jax.vjp(nearest_at, point_world, has_aux=True)
+    (own_normal,) = pull(jnp.ones_like(nearest.sdf))
+    plane = lookup.nearest_plane_at(config, surface, point_world)
+    clamped = geometry.clamp(config, point_world)
+    depth = -lookup.frontier_at(config, surface, clamped)
+    x, y, z = each(jnp.equal, point_world, clamped)
+    inside = x & y & z
+    empty = inside & (depth < -_FREE_VOXELS * size) & (plane.away > _EMPTY_VOXELS * size)
+
+    beside, width = plane.beside / size, plane.width / size
+    usable = inside & (beside < _MOST_BESIDE_VOXELS[0]) & (width > _LEAST_WIDTH_VOXELS[0])
+    known = jnp.where(usable, jax.lax.stop_gradient(width), 0)
+    # Where most patches are narrow, none can be left out.
+    strict = share * growing
+    usable &= beside < between(_MOST_BESIDE_VOXELS, strict)
+    usable &= width > between(_LEAST_WIDTH_VOXELS, strict)
+
+    # A sheet's distance grows on both sides, the height above its plane on one.
+    side = jnp.where(dot(own_normal, plane.normal) < 0, -1, 1)
+    distance = share * nearest.sdf + (1 - share) * side * plane.height
+    normal = each(lambda n, p: share * n + (1 - share) * side * p, own_normal, plane.normal)
+    spread = share * nearest.spread + (1 - share) * plane.spread
+    usable &= ~_is_back(config, surface, point_world, offset, normal)
+    return Match(distance, normal, spread, depth, usable & _is_steep(normal), empty, known)
+
+
+def match_baked(baked: Baked, point_world: Vector) -> Match:
+    """Compares points, (...) m each, with a baked field, as `match_at` does with a live map."""
+    answer = query(baked, join(point_world))
+    normal = split(answer.grad)
+    # `bake` takes half a cell's diagonal off the frontier.
+    depth = -answer.frontier - 3**0.5 / 2 * baked.resolution
+    none = jnp.zeros_like(depth)
+    spread = none + _BAKED_SPREAD * baked.resolution
+    empty = none > 0  # all points are usable
+    return Match(answer.sdf, normal, spread, depth, _is_steep(normal), empty, none)
+
+
+def _is_steep(normal: Vector) -> jax.Array:
+    return dot(normal, normal) > _LEAST_SLOPE**2
 
 
 def _is_back(
-    field: Field, points_world: jax.Array, offset: jax.Array, normal: jax.Array
+    config: Config, surface: Surface, point_world: Vector, offset: Vector, normal: Vector
 ) -> jax.Array:
-    """Returns a mask of points whose nearest surface faces away from the sensor, (N,) bool.
+    """Returns a mask of points whose nearest surface faces away from the sensor, (...) bool.
 
     A wall that was seen from the next room alone would hold the returns from its other side. Sheets
     whose two sides are free have a front for every sensor.
     """
-    size = field.config.voxel_size
-    away = jnp.sum(offset**2, axis=-1, keepdims=True)
-    before = points_world - size * offset * jax.lax.rsqrt(jnp.maximum(away, 1e-6))
-    behind = _voxel_sdf(field, before) < -_BACK_VOXELS * size
-    return behind & (jnp.sum(normal * offset, axis=-1) > 0)
+    size = config.voxel_size
+    scale = size * jax.lax.rsqrt(jnp.maximum(dot(offset, offset), 1e-6))
+    before = each(lambda p, o: p - o * scale, point_world, offset)
+    behind = _voxel_sdf(config, surface, before) < -_BACK_VOXELS * size
+    return behind & (dot(normal, offset) > 0)
 
 
 def find_blocked(
@@ -168,7 +183,9 @@ def find_blocked(
     share = (jnp.arange(_RAY_POINTS, dtype=jnp.float32) + 0.5) / _RAY_POINTS * reach[:, None]
     points_world = pose[:3, 3] + offset[:, None] * share[..., None]
     before = points_world - voxel_size * (offset / distance[:, None])[:, None]
-    here, there = (_voxel_sdf(field, points) for points in (points_world, before))
+    here, there = (
+        _voxel_sdf(field.config, field.surface, split(points)) for points in (points_world, before)
+    )
     # The ray must come from the front. Behind walls that were seen from one side, solids are a
     # guess, and a sensor in the next room sees the wall from there.
     enters = (there > here) & (there < here + _FRONT_VOXELS * voxel_size)
@@ -176,21 +193,27 @@ def find_blocked(
     return some & jnp.any(solid, axis=-1)
 
 
-def _voxel_sdf(field: Field, points_world: jax.Array) -> jax.Array:
+def _voxel_sdf(config: Config, surface: Surface, point: Vector) -> jax.Array:
     """The signed distances of the voxels that contain points, (...) m; inf outside the bounds.
 
     The patches would be more exact, but hypotheses under vmap would need 7 times the memory.
     """
-    index, _, inside = geometry.voxel_of(field.config, points_world)
-    row = geometry.flat_index(field.config.grid_shape, split(index))
-    sdf = field.surface.derived.sdf.ravel()[row].astype(jnp.float32)
-    return jnp.where(inside, sdf, jnp.inf)
+    index, inside = geometry.voxel_around(config, point)
+    row = geometry.flat_index(config.grid_shape, index)
+    return jnp.where(inside, surface.derived.sdf.ravel()[row].astype(jnp.float32), jnp.inf)
 
 
-def _share_of_map(width: jax.Array, usable: jax.Array) -> jax.Array:
-    """How far distances are the map's own, not those from planes: from 0 to 1, for all points."""
-    total = jnp.sum(jnp.where(usable, jax.lax.stop_gradient(width), 0))
-    mean = total / jnp.maximum(jnp.sum(usable), 1)
+def share_of_map(width: jax.Array, count: jax.Array) -> jax.Array:
+    """Computes how far distances are the map's own, not those from planes.
+
+    Args:
+        width: Sum of `Match.width`, () voxels.
+        count: Number of points that have a width, ().
+
+    Returns:
+        () from 0 to 1.
+    """
+    mean = width / jnp.maximum(count, 1)
     return jnp.clip((mean - _NARROW_VOXELS) / (_WIDE_VOXELS - _NARROW_VOXELS), 0, 1)
 
 

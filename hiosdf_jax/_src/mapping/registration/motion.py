@@ -5,9 +5,12 @@ Both are along the axes of the world frame, and the rotation is about the sensor
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.numerics.point_kernel import by_points
 from hiosdf_jax._src.numerics.small_matrices import product
 
 # Below this angle, rad, series replace quotients of small numbers.
@@ -25,9 +28,20 @@ def move(pose: jax.Array, motion: jax.Array) -> jax.Array:
         (4, 4).
     """
     pose = jnp.asarray(pose)
-    rotation = product(rotation_of(motion[3:]), pose[:3, :3])
-    moved = jnp.concatenate([rotation, (pose[:3, 3] + motion[:3])[:, None]], axis=1)
-    return jnp.concatenate([moved, pose[3:]])
+    return by_points(_move_at, None, (), pose.reshape(1, 16), motion[None], least=1).reshape(4, 4)
+
+
+def _move_at(static: None, tables: Any, pose: Any, motion: Any) -> tuple[jax.Array, ...]:
+    """Moves poses whose sixteen numbers are arrays of their own."""
+    turn = _rotation_entries(*motion[3:])
+
+    def entry(i: int, j: int) -> jax.Array:
+        if j == 3:
+            return pose[4 * i + 3] + motion[i]
+        x, y, z = turn[3 * i : 3 * i + 3]
+        return x * pose[j] + y * pose[4 + j] + z * pose[8 + j]
+
+    return (*(entry(i, j) for i in range(3) for j in range(4)), *pose[12:])
 
 
 def offsets_from(pose: jax.Array, points: jax.Array) -> jax.Array:
@@ -70,19 +84,25 @@ def way_and_angle(first: jax.Array, second: jax.Array) -> tuple[jax.Array, jax.A
 
 def rotation_of(vector: jax.Array) -> jax.Array:
     """Computes the rotation about a vector (3,) by its length, rad; (3, 3)."""
-    square = jnp.sum(vector**2)
+    x, y, z = vector
+    return jnp.stack(_rotation_entries(x, y, z)).reshape(3, 3)
+
+
+def _rotation_entries(x: jax.Array, y: jax.Array, z: jax.Array) -> list[jax.Array]:
+    """The numbers of `rotation_of`, row by row."""
+    square = x * x + y * y + z * z
     small = square < _SMALL**2
     angle = jnp.sqrt(jnp.where(small, 1, square))
     first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
     second = jnp.where(small, 0.5 - square / 24, (1 - jnp.cos(angle)) / angle**2)
-    x, y, z = vector
-    zero = jnp.zeros_like(x)
-    across = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return (
-        (1 - second * square) * jnp.eye(3, dtype=jnp.float32)
-        + first * across
-        + second * vector[:, None] * vector
-    )
+    across, vector = [[None, -z, y], [z, None, -x], [-y, x, None]], (x, y, z)
+    return [
+        1 - second * (square - vector[i] ** 2)
+        if i == j
+        else first * across[i][j] + second * vector[i] * vector[j]
+        for i in range(3)
+        for j in range(3)
+    ]
 
 
 def vector_of(rotation: jax.Array) -> jax.Array:

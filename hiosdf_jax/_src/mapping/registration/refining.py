@@ -19,7 +19,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
 )
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
-from hiosdf_jax._src.mapping.registration.selection import draw_evenly
+from hiosdf_jax._src.mapping.registration.selection import draw_evenly, take_evenly_on_host
 from hiosdf_jax._src.mapping.registration.solving import (
     COMPLETE_REACH_M,
     MOST_STARTS,
@@ -29,7 +29,6 @@ from hiosdf_jax._src.mapping.registration.solving import (
     solve_fine,
 )
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
-from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
     as_floats,
@@ -126,14 +125,15 @@ def refine_pose(
     most = np.asarray(1 if prior is not None else starts, np.int32)
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
-    floats, _ = cloud_and_returns(cloud)
-    # Padded to a multiple of one size, so that clouds of a stream share their compilation.
-    rows = -(-len(floats) // _CANDIDATES) * _CANDIDATES
-    padded = np.full((rows, 3), np.nan, np.float32)
-    padded[: len(floats)] = floats
+    floats, some = cloud_and_returns(cloud)
+    if isinstance(field, Field):
+        x, y, z = (floats * floats).T
+        some &= x + y + z >= np.float32(field.config.min_range**2)
+    # Here rather than on the device: less is moved there, and all clouds share one compilation.
+    candidates = take_evenly_on_host(floats, some, _CANDIDATES)
     checked = check_pose(pose)
     with collector_paused():
-        return _refine_jit(field, padded, checked, prior, checked_noise, reach, most)
+        return _refine_jit(field, candidates, checked, prior, checked_noise, reach, most)
 
 
 @plain
@@ -143,7 +143,7 @@ def _refine(
     pose: jax.Array,
     prior: tuple[jax.Array, jax.Array] | None,
     noise: jax.Array | None,
-    reach_m: jax.Array,
+    reach_m: Any,
     starts: jax.Array | np.ndarray,
 ) -> Registration:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
@@ -164,7 +164,9 @@ def _refine(
         anchor = Anchor(mean, jnp.linalg.inv(per_unit[:, None] * covariance * per_unit))
 
     still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
-    near = solve_coarse(still, frozen, jax.lax.stop_gradient(pose), held, reach_m, starts)
+    begin = jax.lax.stop_gradient(pose)
+    near, share = solve_coarse(still, frozen, begin, held, reach_m, starts)
+    rows, frozen = rows._replace(share=share), frozen._replace(share=share)
     index, directions = select_rows(still, frozen, near)
     chosen = take_rows(frozen, index)
     found, residuals, rests, inflation = solve_fine(still, chosen, near, directions, held)
@@ -185,10 +187,10 @@ def _refine(
 _refine_jit = jax.jit(_refine)
 
 
-def checked_reach(reach_m: Any) -> jax.Array:
+def checked_reach(reach_m: Any) -> Any:
     """Checks the argument `reach_m`, of tracers only the shape, and returns it as () float32."""
     if not is_traced(reach_m):
-        return scalar(as_number("reach_m", reach_m, 0.0, above=True))
+        return np.asarray(as_number("reach_m", reach_m, 0.0, above=True), np.float32)
     if np.shape(reach_m) != ():
         raise ValueError(f"reach_m has shape {np.shape(reach_m)}, expected one number")
     return jnp.asarray(reach_m, jnp.float32)

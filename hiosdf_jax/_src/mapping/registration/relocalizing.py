@@ -203,9 +203,9 @@ def _find_places(
 
     def improve(start: jax.Array) -> tuple[jax.Array, jax.Array]:
         still, frozen, begin = jax.lax.stop_gradient((field, fewer, start))
-        pose = solve_coarse(still, frozen, begin, Anchor(begin, None), _REACH_M)
+        pose, share = solve_coarse(still, frozen, begin, Anchor(begin, None), _REACH_M)
         pose = jnp.where(jnp.all(jnp.isfinite(pose)), pose, start)
-        return pose, _score(field, rows, pose)
+        return pose, _score(field, rows._replace(share=share), pose)
 
     poses, scores = jax.lax.map(improve, starts, batch_size=_KEPT_AT_ONCE)
     chosen = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.numerics.masks import count_below, running_sum
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
@@ -31,6 +32,26 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     some = jnp.arange(count) < total
     row = jnp.where(some, jnp.minimum(row, cloud.shape[0] - 1), 0)
     return jnp.where(some[:, None], cloud[row], 0), some
+
+
+def take_evenly_on_host(cloud: np.ndarray, some: np.ndarray, count: int) -> np.ndarray:
+    """Selects the rows that `draw_evenly` selects.
+
+    Args:
+        cloud: (N, 3) m.
+        some: The row is a return, (N,) bool.
+        count: Most rows to select.
+
+    Returns:
+        (count, 3) m; NaN after the last return.
+    """
+    returns = None if some.all() else np.flatnonzero(some)  # a third of the time, where all are
+    total = len(cloud) if returns is None else len(returns)
+    share = max(np.float32(total) / np.float32(count), np.float32(1))
+    rank = (np.arange(min(total, count), dtype=np.float32) * share).astype(np.int32)
+    result = np.full((count, 3), np.nan, np.float32)
+    result[: len(rank)] = cloud.take(rank if returns is None else returns[rank], axis=0)
+    return result
 
 
 def even_steps(total: jax.Array, count: int) -> jax.Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     Fit,
     Residuals,
     Rows,
+    Sums,
     balance,
     compare,
     find_directions,
@@ -24,7 +25,9 @@ from hiosdf_jax._src.mapping.registration.equations import (
     fit_of,
     fits_better,
     information_of,
+    no_sums,
     slope_of,
+    sum_returns,
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.motion import move, way_and_angle
@@ -79,6 +82,9 @@ _FINISHED_M = 5e-5
 _RESTING_M = 2e-3
 
 
+# Whether a pose rests is asked after this many steps: on a GPU the answer takes as long as a step.
+_STEPS_AT_ONCE = 4
+
 COMPLETE_REACH_M = 0.7
 """How far surfaces may be from where they should be, in a complete map."""
 
@@ -93,7 +99,7 @@ def solve_coarse(
     anchor: Anchor,
     reach_m: jax.Array | float,
     starts: jax.Array | np.ndarray | int = 1,
-) -> jax.Array:
+) -> tuple[jax.Array, jax.Array]:
     """Brings a pose near the solution, with a tolerance that shrinks from step to step.
 
     Args:
@@ -106,7 +112,7 @@ def solve_coarse(
             returns do not fit.
 
     Returns:
-        The pose (4, 4) at which the returns fit best.
+        The pose (4, 4) at which the returns fit best, and `Rows.share` there.
     """
     few = take_evenly(rows)
     shrink = _COARSE_END_M / reach_m
@@ -114,19 +120,20 @@ def solve_coarse(
     motions = size * jnp.concatenate([jnp.zeros((1, 6), jnp.float32), _OTHER_STARTS])
     unknown = Fit(jnp.float32(jnp.inf), jnp.float32(0))
 
-    def step(i: jax.Array, carry: tuple[jax.Array, Residuals]) -> tuple[jax.Array, Residuals]:
-        pose, _ = carry
+    def step(i: jax.Array, carry: tuple[jax.Array, Sums]) -> tuple[jax.Array, Sums]:
+        pose, before = carry
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
-        residuals = compare(field, few, pose, scale_m)
+        share = jnp.where(i > 0, before.share, few.share)
+        sums = sum_returns(field, few._replace(share=share), pose, scale_m)
         # Fine steps bring free directions back.
-        motion = find_step(residuals, None, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
-        return move(pose, motion), residuals
+        motion = find_step(sums, None, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
+        return move(pose, motion), sums
 
-    def begin(carry: tuple[jax.Array, Fit, jax.Array]) -> tuple[jax.Array, Fit, jax.Array]:
+    def begin(carry: tuple[Any, Fit, jax.Array]) -> tuple[Any, Fit, jax.Array]:
         best, least, number = carry
-        start = move(pose, motions[number]), _no_residuals(field, few, pose)
-        found, residuals = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
-        fit = fit_of(residuals, few.some)
+        start = move(pose, motions[number]), no_sums()
+        found, sums = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
+        fit = fit_of(sums, few.some)
         way, angle = way_and_angle(pose, found)
         most = _FARTHEST * size
         near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
@@ -134,14 +141,16 @@ def solve_coarse(
         fit = fit._replace(loss=jnp.where(usable, fit.loss, jnp.inf))
         better = (number == 0) | fits_better(fit, least)
         pick = partial(jnp.where, better)
-        return *jax.tree.map(pick, (found, fit), (best, least)), number + 1
+        result = found, sums.share
+        return *jax.tree.map(pick, (result, fit), (best, least)), number + 1
 
-    def continues(carry: tuple[jax.Array, Fit, jax.Array]) -> jax.Array:
+    def continues(carry: tuple[Any, Fit, jax.Array]) -> jax.Array:
         _, least, number = carry
         fits = (least.loss <= _MOST_LOSS) & (least.known >= _LEAST_KNOWN)
         return (number < starts) & ~fits
 
-    return jax.lax.while_loop(continues, begin, (pose, unknown, jnp.int32(0)))[0]
+    first = (pose, few.share), unknown, jnp.int32(0)
+    return jax.lax.while_loop(continues, begin, first)[0]
 
 
 def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.Array, Directions]:
@@ -207,18 +216,21 @@ def solve_fine(
         The solution.
     """
     one = jnp.ones((), jnp.float32)
-    solution = Solution(pose, _no_residuals(field, rows, pose), jnp.zeros((), bool), one)
-    if anchor.information is None:
-        return _rest(field, rows, solution, directions, anchor, _FINE_START_M)
 
-    def solve(number: jax.Array, found: Solution) -> Solution:
+    def solve(inflation: jax.Array, pose: jax.Array, start_m: jax.Array | float) -> Solution:
+        found, rests = _rest(field, rows, pose, inflation, directions, anchor, start_m)
+        return Solution(found, compare(field, rows, found, 0.0), rests, inflation)
+
+    if anchor.information is None:
+        return solve(one, pose, _FINE_START_M)
+
+    def solve_again(number: jax.Array, found: Solution) -> Solution:
         again = number > 0
         inflation = jnp.where(again, inflation_of(found.residuals, directions), one)
-        start_m = jnp.where(again, 0, _FINE_START_M)
-        found = found._replace(inflation=inflation)
-        return _rest(field, rows, found, directions, anchor, start_m)
+        return solve(inflation, found.pose, jnp.where(again, 0, _FINE_START_M))
 
-    return jax.lax.fori_loop(0, 2, solve, solution)
+    start = Solution(pose, _no_residuals(field, rows, pose), jnp.zeros((), bool), one)
+    return jax.lax.fori_loop(0, 2, solve_again, start)
 
 
 def _no_residuals(field: Field | Baked, rows: Rows, pose: jax.Array) -> Residuals:
@@ -230,36 +242,44 @@ def _no_residuals(field: Field | Baked, rows: Rows, pose: jax.Array) -> Residual
 def _rest(
     field: Field | Baked,
     rows: Rows,
-    solution: Solution,
+    pose: jax.Array,
+    inflation: jax.Array,
     directions: Directions,
     anchor: Anchor,
     start_m: jax.Array | float,
-) -> Solution:
-    """Steps from a pose until it rests, with surfaces up to `start_m` off in the first step."""
+) -> tuple[jax.Array, jax.Array]:
+    """Steps until a pose rests, with surfaces up to `start_m` off in the first step.
 
-    def tolerance(count: jax.Array) -> jax.Array:
+    Returns:
+        The pose (4, 4), and whether it rests, () bool.
+    """
+
+    def step(count: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple:
+        pose, _ = carry
         scale_m = start_m * _FINE_SHRINK ** count.astype(jnp.float32)
-        return jnp.where(scale_m > _FINE_END_M, scale_m, 0)
-
-    # A step begins with the returns that the last one has compared, and the first one stays in
-    # place. So they are compared at one place of the program: each takes seconds to compile.
-    def step(carry: tuple[jax.Array, Residuals, jax.Array, jax.Array]) -> tuple:
-        pose, residuals, _, count = carry
-        motion = find_step(residuals, directions, anchor, rows, pose, solution.inflation)
+        sums = sum_returns(field, rows, pose, jnp.where(scale_m > _FINE_END_M, scale_m, 0))
+        motion = find_step(sums, directions, anchor, rows, pose, inflation)
         way = jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
-        motion = jnp.where(count <= _WHOLE_STEPS, motion, 0.5 * motion)
-        pose = move(pose, jnp.where(count > 0, motion, 0))
-        residuals = compare(field, rows, pose, tolerance(count))
-        return pose, residuals, jnp.where(count > 0, way, jnp.inf), count + 1
+        motion = jnp.where(count < _WHOLE_STEPS, motion, 0.5 * motion)
+        # Exact comparisons alone say whether a pose rests.
+        return move(pose, motion), jnp.where(scale_m > _FINE_END_M, jnp.inf, way)
 
-    def continues(carry: tuple[jax.Array, Residuals, jax.Array, jax.Array]) -> jax.Array:
-        _, _, way, count = carry
-        rests = (way <= _FINISHED_M) & (tolerance(count - 1) == 0)
-        return (count <= _FINE_STEPS) & ~rests
+    def steps(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
+        pose, way, count = carry
 
-    start = (solution.pose, solution.residuals, jnp.float32(jnp.inf), jnp.int32(0))
-    pose, residuals, way, _ = jax.lax.while_loop(continues, step, start)
-    return Solution(pose, residuals, way <= _RESTING_M, solution.inflation)
+        def one(more: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple:
+            return step(count + more, carry)
+
+        pose, way = jax.lax.fori_loop(0, _STEPS_AT_ONCE, one, (pose, way))
+        return pose, way, count + _STEPS_AT_ONCE
+
+    def continues(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, way, count = carry
+        return (count < _FINE_STEPS) & (way > _FINISHED_M)
+
+    start = pose, jnp.float32(jnp.inf), jnp.int32(0)
+    pose, way, _ = jax.lax.while_loop(continues, steps, start)
+    return pose, way <= _RESTING_M
 
 
 def differentiable(
