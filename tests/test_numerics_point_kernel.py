@@ -184,6 +184,19 @@ def test_vectors_are_gathered_from_any_table(interpreted, dtype, size):
     )
 
 
+def test_shards_are_left_to_xla(monkeypatch, interpreted):
+    mesh = jax.make_mesh((1,), ("x",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec = jax.sharding.PartitionSpec("x")
+    evaluate = jax.shard_map(
+        functools.partial(by_points, looked_up, 7.0, TABLES),
+        mesh=mesh,
+        in_specs=spec,
+        out_specs=spec,
+    )
+    found, expected = by_both(monkeypatch, evaluate, points_of(COUNT))
+    assert_close(found, expected)
+
+
 def test_second_derivatives(monkeypatch, interpreted):
     def mean(point):
         return by_points(looked_up, 7.0, TABLES, point)["mean"]

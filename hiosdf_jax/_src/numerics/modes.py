@@ -128,6 +128,11 @@ def run_if(pred: jax.Array, function: Callable[[Any], Any], value: Any, *others:
     return jax.lax.while_loop(lambda carry: carry[0], body, vary((pred, value)))[1]
 
 
+def is_varying(tree: Any) -> bool:
+    """Returns whether an array of a pytree varies over axes of the mesh of `jax.shard_map`."""
+    return any(map(_varying_axes, jax.tree.leaves(tree)))
+
+
 def _varying_axes(leaf: jax.Array) -> frozenset[Any]:
     """Returns the axes of the mesh that an array varies over inside `jax.shard_map`."""
     kind: Any = jax.typeof(leaf)

@@ -26,6 +26,7 @@ from hiosdf_jax._src.mapping.registration.matching import (
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move
 from hiosdf_jax._src.mapping.registration.selection import even_steps
 from hiosdf_jax._src.numerics import devices
+from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.point_kernel import by_points, columns, joined, sum_by_points
 from hiosdf_jax._src.numerics.small_matrices import product, solve_entries, solve_positive
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each
@@ -229,7 +230,7 @@ def sum_returns(
     is looked up once.
     """
     if isinstance(field, Baked) or not devices.has_kernels():
-        return sums_of(compare(field, rows, pose, scale_m))
+        return sums_of(compute_once(compare(field, rows, pose, scale_m)))
     arguments, numbers = _arguments(rows, pose, scale_m)
     return Sums(sum_by_points(_terms_at, field.config, field.surface, *arguments, numbers=numbers))
 
