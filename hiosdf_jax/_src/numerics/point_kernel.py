@@ -40,6 +40,8 @@ _BLOCK_OF_SUMS, _WARPS_OF_SUMS, _MOST_TURNS = 32, 1, 8
 _LEAST_POINTS = 256  # fewer gain little
 _MOST_POINTS = 2**26  # indices into results are int32
 
+_KEPT = 256  # functions with a configuration that are kept
+
 INTERPRET: Any = None  # True interprets the kernel on a CPU, for tests
 
 Function = Callable[..., Any]
@@ -51,27 +53,30 @@ def by_points(
     tables: Any,
     *rows: jax.Array,
     numbers: jax.Array | None = None,
-    least: int = _LEAST_POINTS,
+    least: int | None = None,
 ) -> Any:
     """Evaluates a function of points and tables.
 
     `jax.vmap` over points, or over numbers, makes more points of one evaluation.
 
     Args:
-        function: Maps `static`, `tables`, the numbers if there are any, and tuples of K arrays
-            (...) for each array of rows, to a pytree of arrays (...) and tuples of them. It reads
-            tables by one array of indices, after `ravel` or `reshape`.
+        function: A function of a module. It maps `static`, `tables`, the numbers if there are any,
+            and a tuple of K arrays (...) for each array of rows, to a pytree of arrays (...) and
+            tuples of them. It reads tables by one array of indices, after `ravel` or `reshape`, or
+            by `vectors.take`.
         static: A hashable argument, such as a configuration.
         tables: A pytree of arrays.
         *rows: Arrays (..., K), all with the same axes (...).
         numbers: What holds for all points, (M,); the function gets a tuple of M arrays.
-        least: Fewer points are left to XLA: the kernel takes longer to compile.
+        least: Fewer points are left to XLA, since the kernel takes longer to compile; by default
+            256.
 
     Returns:
         The pytree; tuples are joined to (..., K). Differentiable as the function is.
     """
     if _fits(tables, numbers, rows):
-        return _with_kernel(function, static, least)(tables, numbers, *rows)
+        fewest = _LEAST_POINTS if least is None else least
+        return _with_kernel(function, static, fewest)(tables, numbers, *rows)
     return _by_xla(function, static, tables, numbers, *rows)
 
 
@@ -127,7 +132,7 @@ def _sum_by_xla(
     return jnp.sum(_by_xla(function, static, tables, numbers, *rows), axis=-2)
 
 
-@functools.cache
+@functools.lru_cache(_KEPT)
 def _with_sum(function: Function, static: Any) -> Function:
     by_xla = plain(functools.partial(_sum_by_xla, function, static))
     by_kernel = plain(functools.partial(_sum_by_kernel, functools.partial(function, static)))
@@ -141,7 +146,7 @@ def _with_sum(function: Function, static: Any) -> Function:
     return evaluate
 
 
-@functools.cache
+@functools.lru_cache(_KEPT)
 def _with_kernel(function: Function, static: Any, least: int) -> Function:
     by_xla = plain(functools.partial(_by_xla, function, static))
     by_kernel = plain(functools.partial(_by_kernel, functools.partial(function, static)))
@@ -286,7 +291,10 @@ class _Inputs:
         self._function = function
         (tables, self._numbers, self._rows), remaining = arguments, iter(references)
         leaves, structure = jax.tree.flatten(tables)
-        kept = [_Table(next(remaining), next(remaining), leaf.shape) for leaf in leaves]
+        kept = [
+            _Table(next(remaining), next(remaining) if _has_words(leaf) else None, leaf.shape)
+            for leaf in leaves
+        ]
         self._tables = jax.tree.unflatten(structure, kept)
         self._references = list(remaining)
 
@@ -324,7 +332,9 @@ def _call(
     from jax.experimental.pallas import triton
 
     tables, *others = arguments
-    arrays = [array for leaf in jax.tree.leaves(tables) for array in (leaf, _words_of(leaf))]
+    arrays = []
+    for leaf in jax.tree.leaves(tables):
+        arrays += [leaf, _words_of(leaf)] if _has_words(leaf) else [leaf]
     arrays += jax.tree.leaves(others)
 
     def entry(*references: Any) -> None:
@@ -345,17 +355,19 @@ def _call(
     return [array.reshape(shape.shape) for array, shape in zip(found, shapes, strict=True)]
 
 
+def _has_words(table: jax.Array) -> bool:
+    """Returns whether short numbers fill whole words of 32 bits, so that no copy is needed."""
+    return table.dtype in (jnp.int8, jnp.int16, jnp.float16) and table.nbytes % 4 == 0
+
+
 def _words_of(table: jax.Array) -> jax.Array:
-    """Returns the same memory as int32 numbers, padded to a whole number of them."""
-    each = 4 // table.dtype.itemsize
-    flat = table.ravel()
-    padded = jnp.pad(flat, (0, -flat.size % each)) if flat.size % each else flat
-    parts = padded.reshape(-1, each) if each > 1 else padded
+    """Returns the same memory as int32 numbers."""
+    parts = table.reshape(-1, 4 // table.dtype.itemsize)
     return jax.lax.bitcast_convert_type(parts, jnp.int32)
 
 
 class _Table:
-    """A table of numbers of at most 32 bits in the GPU's memory.
+    """A table in the GPU's memory.
 
     It is read by one array of indices, after `ravel` or `reshape`, or by `vectors.take`.
     """
@@ -376,7 +388,7 @@ class _Table:
         # No index reads beyond the table, whatever a map holds.
         return self._reference[jnp.clip(index.astype(jnp.int32), 0, math.prod(self.shape) - 1)]
 
-    def take(self, rows: jax.Array, first: int) -> Vector:
+    def gather(self, rows: jax.Array, first: int) -> Vector:
         """Gathers as `vectors.take` does.
 
         Reads are what takes the time. Three short numbers in a row lie in two words of 32 bits: a
@@ -384,8 +396,9 @@ class _Table:
         """
         start = rows.astype(jnp.int32) * self.shape[1] + first
         size, bits = math.prod(self.shape), 8 * self.dtype.itemsize
-        if bits == 32:
-            x, y, z = (self[start + k] for k in range(3))
+        if self._words is None:
+            wide = jnp.float32 if jnp.issubdtype(self.dtype, jnp.floating) else jnp.int32
+            x, y, z = (self[start + k].astype(wide) for k in range(3))
             return x, y, z
         start = jnp.clip(start, 0, size - 3)
         each = 32 // bits
@@ -412,7 +425,9 @@ def _results_of(function: Function, tables: Any, numbers: Any, rows: Sequence[An
 
     given = () if numbers is None else (split(numbers),)
     arguments = *given, *map(split, rows)
-    return jax.eval_shape(lambda *all: joined(function(*all)), tables, *arguments)
+    results = jax.eval_shape(lambda *all: joined(function(*all)), tables, *arguments)
+    assert all(leaf.shape[: len(axes)] == axes for leaf in jax.tree.leaves(results))
+    return results
 
 
 def _is_tuple(value: Any) -> bool:

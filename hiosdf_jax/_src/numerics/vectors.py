@@ -43,8 +43,8 @@ def take(table: Any, rows: jax.Array, first: int = 0) -> Vector:
     Returns:
         The components, (...) each.
     """
-    if not isinstance(table, jax.Array):
-        return table.take(rows, first)
+    if hasattr(table, "gather"):
+        return table.gather(rows, first)
     floats = jnp.issubdtype(table.dtype, jnp.floating)
     dtype = jnp.float32 if floats else jnp.int32
     # One index per number: a pair takes twice as long on a CPU. Unsigned: no check for negative

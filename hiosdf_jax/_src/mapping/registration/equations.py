@@ -6,9 +6,8 @@ components of a motion have one unit, and directions can be compared.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -97,7 +96,8 @@ class Rows(NamedTuple):
         some: The row is a return, (N,) bool.
         length: Typical range, () m: a rotation by 1 rad counts as this many meters.
         growing: How incomplete the map is, () from 0 to 1: a return may be of a new surface.
-        share: How far distances are the map's own, () from 0 to 1; see `matching.share_of_map`.
+        share: How far distances are the map's own, () from 0 to 1; see `matching.share_of_map`. It
+            is 1 until it is measured.
     """
 
     points: jax.Array
@@ -339,6 +339,11 @@ class Sums(NamedTuple):
         return share_of_map(self.values[29], self.values[30])
 
 
+def measure_share(field: Field | Baked, rows: Rows, pose: jax.Array) -> Rows:
+    """Measures `Rows.share` where returns are at a pose (4, 4)."""
+    return rows._replace(share=sum_returns(field, rows, pose, 0.0).share)
+
+
 def sums_of(residuals: Residuals) -> Sums:
     """Sums residuals over the returns."""
     information, slope = normal_equations(residuals)
@@ -436,9 +441,10 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
         return jnp.sum(more) / jnp.maximum(jnp.sum(both), 1)
 
     way = _TRIED_M * basis.T[:_TRIED_DIRECTIONS] / units(rows)
+    ways = jnp.concatenate([way, -way])
     # All at once would need much memory where XLA makes arrays of all that leads to the losses.
-    each_way = jax.vmap if devices.has_kernels() else partial(partial, jax.lax.map)
-    grown = each_way(growth)(jnp.concatenate([way, -way])).reshape(2, -1)
+    at_once = devices.has_kernels() and isinstance(field, Field)
+    grown = (jax.vmap(growth)(ways) if at_once else jax.lax.map(growth, ways)).reshape(2, -1)
     least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
     free = ~(jnp.min(grown, axis=0) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
@@ -555,6 +561,7 @@ def find_step(
         The motion, (6,) m and rad.
     """
     if directions is None and anchor.information is None:
+        # Inflation cancels where nothing else holds the pose.
         length = rows.length[None]
         return by_points(_free_step_at, damping, (), sums.values[None], numbers=length, least=1)[0]
     information = _whole(sums.information) / inflation
@@ -569,8 +576,8 @@ def find_step(
 
 def _free_step_at(damping: float, tables: Any, length: Any, sums: Any) -> tuple[jax.Array, ...]:
     """Computes a step along the axes that nothing but the returns holds, (...) each."""
-    lower = dict(zip(_LOWER, sums, strict=False))
-    more = damping / 6 * functools.reduce(jnp.add, [lower[i, i] for i in range(6)])
+    lower = dict(zip(_LOWER, sums[:21], strict=True))
+    more = damping / 6 * reduce(jnp.add, [lower[i, i] for i in range(6)])
     matrix = [[lower[i, j] + (more if i == j else 0) for j in range(i + 1)] for i in range(6)]
     step = solve_entries(matrix, sums[21:27])
     return (*(-part for part in step[:3]), *(-part / length[0] for part in step[3:]))

@@ -1,6 +1,6 @@
 """What the map says of the returns of a cloud: distance, normal, spread, observed or not.
 
-Functions of points take and return vectors as three arrays, so that one kernel can compute them.
+What is named `at` takes and returns vectors as three arrays, so that one kernel can compute it.
 """
 
 from __future__ import annotations

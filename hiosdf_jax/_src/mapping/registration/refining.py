@@ -127,8 +127,9 @@ def refine_pose(
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
     floats, some = cloud_and_returns(cloud)
     if isinstance(field, Field):
-        x, y, z = (floats * floats).T
-        some &= x + y + z >= np.float32(field.config.min_range**2)
+        with np.errstate(over="ignore"):
+            x, y, z = (floats * floats).T
+            some &= x + y + z >= np.float32(field.config.min_range**2)
     # Here rather than on the device: less is moved there, and all clouds share one compilation.
     candidates = take_evenly_on_host(floats, some, _CANDIDATES)
     checked = check_pose(pose)

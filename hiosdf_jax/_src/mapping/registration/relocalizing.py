@@ -23,6 +23,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     Rows,
     compare,
     make_rows,
+    measure_share,
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.matching import noise_of
@@ -274,7 +275,11 @@ def _choose(
 ) -> Relocalization:
     """Chooses the best two of refined poses that are not at one place."""
     rows = _rows(field, points, some)
-    scores = jax.lax.map(lambda pose: _score(field, rows, pose), refined.pose)
+
+    def score(pose: jax.Array) -> jax.Array:
+        return _score(field, measure_share(field, rows, pose), pose)
+
+    scores = jax.lax.map(score, refined.pose)
     best = jnp.argmax(scores)
     elsewhere = jnp.where(_same_place(refined.pose[best], refined.pose), 0, scores)
     other = jnp.argmax(elsewhere)

@@ -112,7 +112,8 @@ def solve_coarse(
             returns do not fit.
 
     Returns:
-        The pose (4, 4) at which the returns fit best, and `Rows.share` there.
+        The pose (4, 4) at which the returns fit best, and `Rows.share` as measured before the last
+        step to it.
     """
     few = take_evenly(rows)
     shrink = _COARSE_END_M / reach_m
@@ -123,8 +124,8 @@ def solve_coarse(
     def step(i: jax.Array, carry: tuple[jax.Array, Sums]) -> tuple[jax.Array, Sums]:
         pose, before = carry
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
-        share = jnp.where(i > 0, before.share, few.share)
-        sums = sum_returns(field, few._replace(share=share), pose, scale_m)
+        # The first step takes planes, which narrow patches have, too.
+        sums = sum_returns(field, few._replace(share=before.share), pose, scale_m)
         # Fine steps bring free directions back.
         motion = find_step(sums, None, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
         return move(pose, motion), sums

@@ -31,11 +31,12 @@ _CELL_M = 0.5
 # Size of the cells that are left out in turn: a share of the typical range, and its limits, m.
 # Errors of a map reach about this far. For 200 poses in the simulated apartment the mean normalized
 # square is 6.2, and 6 is right. With 3,072 returns it was 5.5, with cells of 0.5 m 7.1, and with
-# cells of 1.2 m 5.4. Cells are spread to at most this many sums, and at most twice as many as there
-# are returns. Those that share one are left out at once.
+# cells of 1.2 m 5.4. Cells are spread to this many sums, or fewer if the rows are few. Those that
+# share one are left out at once.
 _LEFT_OUT_SHARE = 0.4
 _LEFT_OUT_M = (0.2, 1.0)
 _LEFT_OUT_SUMS = 1024
+_LEAST_SUMS = 512
 _LEAST_LEFT = 1e-3  # share of a direction's information that always stays
 
 _FREE_M = 100.0  # standard deviation of a free direction without a prior
@@ -93,7 +94,7 @@ def _jackknife(residuals: Residuals, directions: Directions, rows: Rows) -> jax.
     weighted = residuals.weight[:, None] * jacobian
     squares = (weighted[:, :, None] * jacobian[:, None, :]).reshape(-1, 36)
     parts = [weighted * residuals.distance[:, None], squares, residuals.weight[:, None]]
-    cells = min(_LEFT_OUT_SUMS, 2 * len(residuals.weight))
+    cells = min(_LEFT_OUT_SUMS, max(_LEAST_SUMS, 2 * len(residuals.weight)))
     sums = sum_in_cells(jnp.concatenate(parts, axis=-1), residuals.points_world, cell_m, cells)
     slope, information = sums[:, :6], sums[:, 6:42].reshape(-1, 6, 6)
     whole = jnp.sum(information, axis=0)
