@@ -38,7 +38,7 @@ from benchmarks.registration import error, perturb
 from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.mapping.registration.equations import GROWING_REACH_M
+from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.judging import LEAST_INLIERS
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.tracking import MOST_MOVED, prior_of_prediction

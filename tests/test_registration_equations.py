@@ -11,8 +11,8 @@ from interpreted import clear, interpret_point_kernels
 from room import CONFIG, HALF, room_cloud
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.registration import equations
-from hiosdf_jax._src.mapping.registration.equations import compare, make_rows
+from hiosdf_jax._src.mapping.registration import comparing, equations
+from hiosdf_jax._src.mapping.registration.comparing import compare, make_rows
 from hiosdf_jax._src.state import field_of
 
 COUNT = 1000
@@ -105,9 +105,9 @@ def test_a_sheet_whose_sides_are_free_holds_returns_from_both():
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_without_directions_a_step_is_that_along_the_axes(with_prior):
     rng = np.random.default_rng(0)
-    rows = equations.make_rows(jnp.ones((50, 3)), jnp.ones(50, bool), (0.01, 0.001))
+    rows = comparing.make_rows(jnp.ones((50, 3)), jnp.ones(50, bool), (0.01, 0.001))
     flags = jnp.ones(50, bool)
-    residuals = equations.Residuals(
+    residuals = comparing.Residuals(
         distance=jnp.float32(rng.normal(size=50)),
         jacobian=jnp.float32(rng.normal(size=(50, 6))),
         sigma=jnp.ones(50),
@@ -122,7 +122,7 @@ def test_without_directions_a_step_is_that_along_the_axes(with_prior):
     axes = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
     found, expected = (
         equations.find_step(
-            equations.sums_of(residuals), directions, anchor, rows, jnp.eye(4), 2.0, 1e-3
+            comparing.sums_of(residuals), directions, anchor, rows, jnp.eye(4), 2.0, 1e-3
         )
         for directions in (None, axes)
     )
@@ -134,7 +134,7 @@ def test_without_directions_a_step_is_that_along_the_axes(with_prior):
     if with_prior:
         information += 3 * np.eye(6)
         slope += 3 * np.array([-0.1, 0, 0, 0, 0, 0])
-    wanted = -np.linalg.solve(information, slope) / np.asarray(equations.units(rows))
+    wanted = -np.linalg.solve(information, slope) / np.asarray(comparing.units(rows))
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
 
 
@@ -146,7 +146,7 @@ def test_the_kernel_of_a_gpu_sums_what_arrays_sum(sharp_map, monkeypatch):
     poses = jnp.stack([jnp.asarray(pose), jnp.asarray(pose).at[:3, 3].add(0.2)])
 
     def sums(poses):
-        each = jax.vmap(lambda pose: equations.sum_returns(field, rows, pose, 0.1).values)
+        each = jax.vmap(lambda pose: comparing.sum_returns(field, rows, pose, 0.1).values)
         return np.asarray(jax.jit(each)(poses))
 
     expected = sums(poses)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.registration import equations, solving
+from hiosdf_jax._src.mapping.registration import comparing, equations, solving
 
 RESOLUTION = 0.05
 NOISE = (0.01, 0.0)
@@ -390,7 +390,7 @@ def test_vmap_over_poses_and_a_scan_of_single_clouds_trace(sharp_map):
 )
 def test_a_pose_rests_by_the_length_of_its_whole_steps(monkeypatch, step_m, steps, rests):
     """Late steps are halved. That must not make a pose that still moves look as if it rested."""
-    rows = equations.make_rows(jnp.ones((1, 3)), jnp.ones(1, bool), (0.01, 0.001))
+    rows = comparing.make_rows(jnp.ones((1, 3)), jnp.ones(1, bool), (0.01, 0.001))
     made = []
 
     def find_step(*_):
@@ -401,11 +401,11 @@ def test_a_pose_rests_by_the_length_of_its_whole_steps(monkeypatch, step_m, step
         zero = jnp.zeros(1)
         flag = jnp.zeros(1, bool)
         world = jnp.zeros((1, 3)) + 0 * pose[0, 3] + 0 * scale_m
-        return equations.Residuals(zero, jnp.zeros((1, 6)), zero, flag, flag, zero, world, zero)
+        return comparing.Residuals(zero, jnp.zeros((1, 6)), zero, flag, flag, zero, world, zero)
 
     monkeypatch.setattr(solving, "find_step", find_step)
     monkeypatch.setattr(solving, "compare", nothing)
-    monkeypatch.setattr(solving, "sum_returns", lambda *given: equations.sums_of(nothing(*given)))
+    monkeypatch.setattr(solving, "sum_returns", lambda *given: comparing.sums_of(nothing(*given)))
     directions = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
     anchor = equations.Anchor(jnp.eye(4), None)
     found = solving.solve_fine(None, rows, jnp.eye(4), directions, anchor)

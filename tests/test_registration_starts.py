@@ -7,9 +7,9 @@ import pytest
 from room import room_cloud
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.registration import equations, refining, solving
+from hiosdf_jax._src.mapping.registration import comparing, equations, refining, solving
 
-ROWS = equations.make_rows(jnp.ones((8, 3)), jnp.ones(8, bool), (0.01, 0.001))
+ROWS = comparing.make_rows(jnp.ones((8, 3)), jnp.ones(8, bool), (0.01, 0.001))
 
 
 @pytest.fixture
@@ -38,14 +38,14 @@ def search(monkeypatch, losses, starts, reach_m=0.7):
         number = jnp.where(jnp.min(way) < 1e-5, jnp.argmin(way) + 1, -1)  # elsewhere the last one
         number = jnp.where(jnp.linalg.norm(pose[:3, 3]) < 1e-5, 0, number)
         loss = jnp.asarray(losses, jnp.float32)[number]
-        ratio = jnp.sqrt(loss / (1 - loss)) * equations.INLIER_DEVIATIONS
+        ratio = jnp.sqrt(loss / (1 - loss)) * comparing.INLIER_DEVIATIONS
         one, flag = jnp.ones(8), jnp.ones(8, bool)
         world = jnp.zeros((8, 3)) + 0 * scale_m
-        return equations.Residuals(
+        return comparing.Residuals(
             ratio * one, jnp.zeros((8, 6)), one, flag, ~flag, one, world, 0 * one
         )
 
-    sum_returns = lambda *arguments: equations.sums_of(compare(*arguments))  # noqa: E731
+    sum_returns = lambda *arguments: comparing.sums_of(compare(*arguments))  # noqa: E731
     monkeypatch.setattr(solving, "sum_returns", sum_returns)
     anchor = equations.Anchor(jnp.eye(4), None)
     pose, _ = solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, reach_m, starts)
@@ -82,8 +82,8 @@ def fit(on_surface, in_free_space, distance=0.0):
     flags = [jnp.asarray(each, bool) for each in (on_surface, in_free_space)]
     count = len(on_surface)
     one, zeros = jnp.ones(count), jnp.zeros((count, 6))
-    residuals = equations.Residuals(distance * one, zeros, one, *flags, one, zeros[:, :3], 0 * one)
-    return equations.fit_of(equations.sums_of(residuals), jnp.ones(count, bool))
+    residuals = comparing.Residuals(distance * one, zeros, one, *flags, one, zeros[:, :3], 0 * one)
+    return equations.fit_of(comparing.sums_of(residuals), jnp.ones(count, bool))
 
 
 def test_returns_in_free_space_are_lost():
@@ -119,9 +119,9 @@ def test_few_returns_that_fit_are_not_enough_to_stop(monkeypatch, begun):
     def compare(_, rows, pose, scale_m):
         zero, flag = jnp.zeros(8) + 0 * scale_m + 0 * pose[0, 3], jnp.arange(8) < 2
         none, world = jnp.zeros(8, bool), jnp.zeros((8, 3))
-        return equations.Residuals(zero, jnp.zeros((8, 6)), zero + 1, flag, none, zero, world, zero)
+        return comparing.Residuals(zero, jnp.zeros((8, 6)), zero + 1, flag, none, zero, world, zero)
 
-    sum_returns = lambda *arguments: equations.sums_of(compare(*arguments))  # noqa: E731
+    sum_returns = lambda *arguments: comparing.sums_of(compare(*arguments))  # noqa: E731
     monkeypatch.setattr(solving, "sum_returns", sum_returns)
     anchor = equations.Anchor(jnp.eye(4), None)
     solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, 0.7, 3)

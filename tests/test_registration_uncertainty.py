@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hiosdf_jax._src.mapping.registration import equations, uncertainty
+from hiosdf_jax._src.mapping.registration import comparing, equations, uncertainty
 
 COUNT = 600
 CELL_M = 1.0  # for a sensor that sees 2.5 m and farther
@@ -24,7 +24,7 @@ def residuals_of(seed, free=0):
     step = np.linalg.solve(bound.T @ (weight[:, None] * bound), bound.T @ (weight * distance))
     distance = distance - bound @ step
     parts = distance, jacobian, np.ones(COUNT), np.ones(COUNT, bool), np.zeros(COUNT, bool)
-    return equations.Residuals(
+    return comparing.Residuals(
         *(jnp.asarray(part, jnp.float32 if part.dtype == float else None) for part in parts),
         weight=jnp.asarray(weight, jnp.float32),
         points_world=jnp.asarray(points, jnp.float32),
@@ -34,14 +34,14 @@ def residuals_of(seed, free=0):
 
 def rows():
     points = jnp.array([[3.0, 0, 0]])
-    return equations.make_rows(points, jnp.ones(1, bool), (0.01, 0.0))
+    return comparing.make_rows(points, jnp.ones(1, bool), (0.01, 0.0))
 
 
 def covariance(residuals, free=0):
     directions = equations.Directions(jnp.eye(6), jnp.arange(6) < free)
     anchor, made = equations.Anchor(jnp.eye(4), None), rows()
     found = uncertainty.covariance_of(residuals, directions, anchor, made)
-    units = np.asarray(equations.units(made), float)
+    units = np.asarray(comparing.units(made), float)
     return units[:, None] * np.asarray(found, float) * units
 
 
@@ -78,7 +78,7 @@ def test_the_covariance_is_that_of_poses_without_each_cell(seed):
     scale = np.sqrt(np.diag(expected))
     close = np.abs(covariance(residuals) - expected) / scale[:, None] / scale
     assert close.max() < 5e-3
-    information = np.asarray(equations.information_of(residuals), float)
+    information = np.asarray(comparing.information_of(residuals), float)
     assert np.linalg.norm(expected) > 3 * np.linalg.norm(np.linalg.inv(information))
 
 
@@ -97,13 +97,13 @@ def test_cells_shrink_with_a_small_scene():
     small = large._replace(
         distance=large.distance / 2, weight=4 * large.weight, points_world=large.points_world / 2
     )
-    half = equations.make_rows(jnp.array([[1.25, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
-    full = equations.make_rows(jnp.array([[2.5, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
+    half = comparing.make_rows(jnp.array([[1.25, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
+    full = comparing.make_rows(jnp.array([[2.5, 0, 0]]), jnp.ones(1, bool), (0.01, 0.0))
     directions = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
     anchor = equations.Anchor(jnp.eye(4), None)
     found = [
         np.asarray(uncertainty.covariance_of(part, directions, anchor, made))
-        * np.outer(equations.units(made), equations.units(made))
+        * np.outer(comparing.units(made), comparing.units(made))
         for part, made in ((large, full), (small, half))
     ]
     np.testing.assert_allclose(found[1], found[0] / 4, rtol=1e-3, atol=1e-9)
@@ -111,7 +111,7 @@ def test_cells_shrink_with_a_small_scene():
 
 def test_a_single_cell_tells_no_more_than_independent_returns():
     residuals = residuals_of(6)._replace(points_world=jnp.full((COUNT, 3), 0.1))
-    information = np.asarray(equations.information_of(residuals), float)
+    information = np.asarray(comparing.information_of(residuals), float)
     np.testing.assert_allclose(covariance(residuals), np.linalg.inv(information), rtol=1e-2)
     none = residuals._replace(weight=jnp.zeros(COUNT))
     assert np.all(np.isfinite(covariance(none, free=6)))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.mapping.registration.equations import GROWING_REACH_M
+from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.tracking import predict_pose, track
 from hiosdf_jax._src.output_files import replacing

@@ -10,7 +10,7 @@ import numpy as np
 
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
-from hiosdf_jax._src.mapping.registration.equations import GROWING_REACH_M
+from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.mapping.registration.equations import (
+from hiosdf_jax._src.mapping.registration.comparing import (
     INLIER_DEVIATIONS,
-    LEAST_COMPARABLE,
     Rows,
     compare,
     take_evenly,
 )
+from hiosdf_jax._src.mapping.registration.equations import LEAST_COMPARABLE
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
 from hiosdf_jax._src.state import Baked, Field
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.field.queries import AnyField, as_field
-from hiosdf_jax._src.mapping.registration.equations import (
+from hiosdf_jax._src.mapping.registration.comparing import (
     GROWING_REACH_M,
-    Anchor,
     make_rows,
     take_rows,
     units,
 )
+from hiosdf_jax._src.mapping.registration.equations import Anchor
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly, take_evenly_on_host

@@ -18,14 +18,14 @@ import numpy as np
 
 from hiosdf_jax._src.field.queries import AnyField, as_field
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.mapping.registration.equations import (
-    Anchor,
+from hiosdf_jax._src.mapping.registration.comparing import (
     Rows,
     compare,
     make_rows,
     measure_share,
     take_evenly,
 )
+from hiosdf_jax._src.mapping.registration.equations import Anchor
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose

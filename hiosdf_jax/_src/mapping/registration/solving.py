@@ -11,24 +11,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.mapping.registration.equations import (
-    Anchor,
-    Directions,
-    Fit,
+from hiosdf_jax._src.mapping.registration.comparing import (
     Residuals,
     Rows,
     Sums,
-    balance,
     compare,
-    find_directions,
-    find_step,
-    fit_of,
-    fits_better,
     information_of,
     no_sums,
     slope_of,
     sum_returns,
     take_evenly,
+)
+from hiosdf_jax._src.mapping.registration.equations import (
+    Anchor,
+    Directions,
+    Fit,
+    balance,
+    find_directions,
+    find_step,
+    fit_of,
+    fits_better,
 )
 from hiosdf_jax._src.mapping.registration.motion import move, way_and_angle
 from hiosdf_jax._src.mapping.registration.selection import draw_informative

@@ -12,17 +12,14 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from hiosdf_jax._src.mapping.registration.comparing import Residuals, Rows, information_of, units
 from hiosdf_jax._src.mapping.registration.equations import (
     Anchor,
     Directions,
-    Residuals,
-    Rows,
-    information_of,
     invert,
     sizes,
     sum_in_cells,
     turn,
-    units,
 )
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
