@@ -23,6 +23,7 @@ from voxels import (
 )
 
 from hiosdf_jax._src.grid import evidence, lookup, patches
+from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state import NO_FEATURE, Side, surface_of
 
 
@@ -209,6 +210,30 @@ def test_distance_does_not_jump_where_free_voxels_meet_voxels_behind_a_surface(r
     assert np.mean(np.abs(before) > 0.1) > 0.05  # where a jump would be 20 cm
     assert observed.sum() > 10_000
     assert np.abs(after - before)[observed].max() < 1e-3
+
+
+def test_a_gradient_can_hold_the_sides_of_space_fixed(room):
+    """Registration does, since the slope of the sides is no normal of a surface."""
+    surface = surface_of(any_sides(room))
+    points = uniform(37, 500)
+
+    @jax.jit
+    def held(points, side_points):
+        return lookup.nearest_patch_at(CONFIG, surface, split(points), split(side_points)).sdf
+
+    gradient = jax.jit(jax.grad(lambda points, fixed: jnp.sum(held(points, fixed))))(points, points)
+    value, whole = distance_at(surface, points)
+    np.testing.assert_allclose(held(points, points), value, atol=1e-6)
+
+    step = 1e-3
+    ahead, behind = (
+        np.stack([held(points + s * step * axis, points) for axis in np.eye(3)], axis=1)
+        for s in (1, -1)
+    )
+    error = np.linalg.norm((ahead - behind) / (2 * step) - gradient, axis=1)
+    assert np.median(error) < 1e-3
+    assert np.mean(error > 0.02) < 0.15  # where the eight voxels change or the value bends
+    assert np.mean(np.linalg.norm(whole - gradient, axis=1) > 0.02) > 0.1
 
 
 def test_a_sheet_seen_from_both_sides_is_free_on_both():

@@ -86,7 +86,8 @@ def test_a_wall_that_was_seen_from_inside_holds_no_returns_from_outside(sharp_ma
     assert seen_from(field, ends, [HALF[0] + 2, 0, 0]) < 0.02
 
 
-def test_a_sheet_whose_sides_are_free_holds_returns_from_both():
+def map_of_a_sheet():
+    """A map of a sheet seen from both sides, the sensor's positions there, and the sheet."""
     rng = np.random.default_rng(0)
     sheet = np.full((COUNT, 3), 0.03, np.float32)  # not on faces of voxels
     sheet[:, 1:] = rng.uniform(-0.5, 0.5, (COUNT, 2))
@@ -96,10 +97,30 @@ def test_a_sheet_whose_sides_are_free_holds_returns_from_both():
         pose = np.eye(4, dtype=np.float32)
         pose[:3, 3] = sides[number % 2]
         state = hio.update(state, sheet - pose[:3, 3], pose)
+    return field_of(state), sides, sheet
+
+
+def test_a_sheet_whose_sides_are_free_holds_returns_from_both():
+    field, sides, sheet = map_of_a_sheet()
     for side in sides:
         for way_m in (-0.01, 0.0, 0.01):
             ends = np.float32([1, 0.8, 0.8]) * sheet + np.float32([way_m, 0, 0])
-            assert seen_from(field_of(state), ends, side) > 0.8
+            assert seen_from(field, ends, side) > 0.8
+
+
+def test_returns_from_the_other_side_of_a_sheet_are_off_by_its_thickness():
+    field, sides, sheet = map_of_a_sheet()
+    ends = np.float32([1, 0.8, 0.8]) * sheet
+    found = []
+    for side in sides:
+        pose = np.eye(4, dtype=np.float32)
+        pose[:3, 3] = side
+        found.append(compared(field, ends - side, pose, 0.0))
+    both = np.asarray(found[0].comparable & found[1].comparable)
+    one, other = (np.asarray(each.sigma, float)[both] ** 2 for each in found)
+    # A patch has one front. The sensors see each return from about the same range and angle.
+    thickness = CONFIG.voxel_size**2 / 12
+    np.testing.assert_allclose(np.abs(one - other), thickness, rtol=0.01)
 
 
 @pytest.mark.parametrize("with_prior", [False, True])

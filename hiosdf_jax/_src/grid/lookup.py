@@ -88,15 +88,31 @@ def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> 
     return by_points(nearest_patch_at, config, surface, points_world)
 
 
-def nearest_patch_at(config: Config, surface: Surface, point: Vector) -> Nearest:
-    """Computes `nearest_patch` at points, (...) m each."""
+def nearest_patch_at(
+    config: Config, surface: Surface, point: Vector, side_point: Vector | None = None
+) -> Nearest:
+    """Computes `nearest_patch` at points.
+
+    Args:
+        config: The map's configuration.
+        surface: The grid's surface.
+        point: (...) m each.
+        side_point: The same points, if the derivative by `point` shall hold the sides of space
+            fixed: where they change, the slope of the distance is no normal of a surface.
+
+    Returns:
+        As `nearest_patch`.
+    """
     point = geometry.clamp(config, point)
     corners = geometry.corners_of(config, point)
     patch = _patches_at(config, surface, corners, point)
     found, distance = patch.found, patch.distance
 
     side = surface.derived.side.ravel()[corners.flat]
-    value = _signed(patch, side, _space_at(config, surface.derived, corners, side, point))
+    around = corners
+    if side_point is not None:
+        around = geometry.corners_of(config, geometry.clamp(config, side_point))
+    value = _signed(patch, side, _space_at(config, surface.derived, around, side, point))
 
     # It cancels from the mean, and so does its derivative.
     least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)

@@ -41,6 +41,11 @@ _EMPTY_VOXELS = 1.5
 # A surface faces away from the sensor if one voxel before it the ray is this deep in the solid.
 _BACK_VOXELS = 0.5
 
+# A return from the other side of a surface without solid voxels behind it lies off its patches by
+# the thickness of the thing, such as a tabletop. That is anything up to a voxel; here its standard
+# deviation. Without it the 95 % error of poses in the house is 1.1 instead of 0.7 cm.
+_THICKNESS_VOXELS = 12**-0.5
+
 # This many points of each ray are looked up. The last one is the first distance before the return.
 # A point is in a solid if it is the second distance behind a surface. One voxel nearer to the
 # sensor the signed distance is larger, by less than the third, unless the ray comes from behind.
@@ -99,7 +104,7 @@ def match_at(
     """
 
     def nearest_at(point: Vector) -> tuple[jax.Array, lookup.Nearest]:
-        nearest = lookup.nearest_patch_at(config, surface, point)
+        nearest = lookup.nearest_patch_at(config, surface, point, side_point=point_world)
         return nearest.sdf, nearest
 
     size = config.voxel_size
@@ -125,6 +130,8 @@ def match_at(
     distance = share * nearest.sdf + (1 - share) * side * plane.height
     normal = each(lambda n, p: share * n + (1 - share) * side * p, own_normal, plane.normal)
     spread = share * nearest.spread + (1 - share) * plane.spread
+    other_side = dot(plane.normal, offset) > 0
+    spread = jnp.where(other_side, jnp.sqrt(spread**2 + (_THICKNESS_VOXELS * size) ** 2), spread)
     usable &= ~_is_back(config, surface, point_world, offset, normal)
     return Match(distance, normal, spread, depth, usable & _is_steep(normal), empty, known)
 
