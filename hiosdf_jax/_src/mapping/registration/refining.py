@@ -13,6 +13,7 @@ from hiosdf_jax._src.field.queries import AnyField, as_field
 from hiosdf_jax._src.mapping.registration.comparing import (
     GROWING_REACH_M,
     make_rows,
+    measure_share,
     take_rows,
     units,
 )
@@ -169,13 +170,15 @@ def _refine(
     near, share = solve_coarse(still, frozen, begin, held, reach_m, starts)
     rows, frozen = rows._replace(share=share), frozen._replace(share=share)
     index, directions = select_rows(still, frozen, near)
-    chosen = take_rows(frozen, index)
+    # These returns lie on narrower patches than others.
+    chosen = measure_share(still, take_rows(frozen, index), near)
     found, residuals, rests, inflation = solve_fine(still, chosen, near, directions, held)
     covariance = covariance_of(residuals, directions, held, rows)
 
     verdict = judge(still, frozen, found)
     finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
-    exact = differentiable(field, take_rows(rows, index), found, directions, anchor, inflation)
+    own = take_rows(rows, index)._replace(share=chosen.share)
+    exact = differentiable(field, own, found, directions, anchor, inflation)
     return Registration(
         pose=jnp.where(finite, exact, pose),
         covariance=covariance,
