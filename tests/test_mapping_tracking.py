@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import CONFIG, arrays_equal, map_of_room, room_cloud
+from room import CONFIG, HALF, arrays_equal, map_of_room, room_cloud
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
@@ -53,6 +53,17 @@ def test_a_frame_of_another_place_changes_nothing_but_the_flags(sharp_map):
     assert hio.Flag(int(state.report.update_flags)) == hio.Flag.NOT_REGISTERED
     same = state.replace(report=sharp_map.report)
     assert arrays_equal(same, sharp_map)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_few_returns_correct_a_prediction_that_is_three_deviations_off(sharp_map, seed):
+    cloud, pose = room_cloud(100 + seed, 20 * COUNT, 0.3, (0.1, 0.05, 0.0))
+    along_x = np.abs(cloud @ pose[:3, :3].T + pose[:3, 3])[:, 0] > HALF[0] - 1e-3
+    few = COUNT // 10
+    rows = *np.flatnonzero(~along_x)[: COUNT - few], *np.flatnonzero(along_x)[:few]
+    _, found = hio.track(sharp_map, cloud[np.array(rows)], moved(pose, [0.14, 0, 0], np.zeros(3)))
+    assert bool(found.converged)
+    assert np.linalg.norm(np.asarray(found.pose)[:3, 3] - pose[:3, 3]) < 0.01
 
 
 def test_the_first_frame_is_fused_as_predicted(empty_map):

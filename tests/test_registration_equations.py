@@ -123,6 +123,23 @@ def test_returns_from_the_other_side_of_a_sheet_are_off_by_its_thickness():
     np.testing.assert_allclose(np.abs(one - other), thickness, rtol=0.01)
 
 
+def test_a_map_that_grows_holds_no_returns_from_the_other_side_of_a_sheet():
+    field, sides, sheet = map_of_a_sheet()
+    ends = np.float32([1, 0.8, 0.8]) * sheet
+    shares = []
+    for growing in (0.0, 1.0):
+        found = []
+        for side in sides:
+            pose = np.eye(4, dtype=np.float32)
+            pose[:3, 3] = side
+            found.append(np.asarray(compared(field, ends - side, pose, growing).comparable))
+        shares.append((np.mean(found[0] | found[1]), np.mean(found[0] & found[1])))
+    complete, grows = np.array(shares)
+    assert complete.min() > 0.7
+    assert grows[0] > 0.5
+    assert grows[1] == 0
+
+
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_without_directions_a_step_is_that_along_the_axes(with_prior):
     rng = np.random.default_rng(0)

@@ -64,6 +64,11 @@ _OTHER_STARTS = np.concatenate(
 # them more: noisy normals seem to constrain directions that the surfaces do not constrain.
 _COARSE_INFLATION = 16.0
 
+# A tolerance lowers the information of returns about as if they were this exact without it, m. That
+# of a prior is lowered alike. Otherwise the first steps keep a pose that is three of its deviations
+# off, and the last ones find a wrong minimum there.
+_COARSE_SIGMA_M = 0.02
+
 # Rows are selected where surfaces may be this far off, m: those that contradict a pose that is not
 # yet right must be among them. Fine steps begin with a smaller tolerance, m, and shrink it by a
 # factor in each step.
@@ -129,8 +134,12 @@ def solve_coarse(
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         # The first step takes planes, which narrow patches have, too.
         sums = sum_returns(field, few._replace(share=before.share), pose, scale_m)
+        held = anchor
+        if held.information is not None:
+            lower = 1 + (scale_m / _COARSE_SIGMA_M) ** 2
+            held = held._replace(information=held.information / lower)
         # Fine steps bring free directions back.
-        motion = find_step(sums, None, anchor, few, pose, _COARSE_INFLATION, _DAMPING)
+        motion = find_step(sums, None, held, few, pose, _COARSE_INFLATION, _DAMPING)
         return move(pose, motion), sums
 
     def begin(carry: tuple[Any, Fit, jax.Array]) -> tuple[Any, Fit, jax.Array]:
