@@ -14,7 +14,8 @@
 - `jitter smoothed`: the same, smoothed afterwards with that deviation, and mapped again three times
 - `glitch`, `glitch left out`: five of them are off by 1 m, or those frames are missing
 - `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
-- `drift known`: the same, and what they predict is a prior: 3 mm and 0.1 degrees per axis
+- `drift known`: the same, and what they predict is a prior. Its standard deviations per axis are
+  1 % of the way and 0.2 degrees per meter
 - `none`: only the first is used
 
 `--wrong-poses` refines each third frame from poses that are 1 m off, in the map before it.
@@ -57,7 +58,8 @@ MODES = (
     "none",
 )
 DRIFT = 0.01, 0.05  # of the way, degrees per meter
-STEP_COVARIANCE = np.diag(np.repeat([0.003, np.radians(0.1)], 3) ** 2)
+STEP_DEVIATION = 0.01, np.radians(0.2)  # of odometry, per axis and meter of the way
+LEAST_WAY_M = 0.05  # shorter ways count as this long
 JITTER = 0.02, 1.0  # m, degrees
 JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 2 / 3)
 MAPPED_AGAIN = 3
@@ -104,7 +106,10 @@ def map_stream(frames, config, mode, seed=0):
             state = hio.update(state, cloud, pose)
         elif mode == "drift known":
             predicted = hio.predict_pose(poses[last], given[last], pose) if i else pose
-            state, found = hio.track(state, cloud, predicted, (predicted, STEP_COVARIANCE))
+            way_m = np.linalg.norm(predicted[:3, 3] - poses[last][:3, 3]) if i else 0
+            deviation = max(way_m, LEAST_WAY_M) * np.repeat(STEP_DEVIATION, 3)
+            prior = predicted, np.diag(deviation**2)
+            state, found = hio.track(state, cloud, predicted, prior)
             pose, fused = found.pose, bool(found.converged)
             last = i if fused else last
         elif mode.startswith("jitter"):

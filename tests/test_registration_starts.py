@@ -70,6 +70,35 @@ def test_starts_are_tried_until_the_returns_fit(monkeypatch, begun, losses, star
     np.testing.assert_allclose(pose[:3, 3], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("loss_there", "way_m", "starts", "kept"),
+    [
+        (0.01, 0.1, 5, True),
+        (0.018, 0.1, 5, False),  # fits no better than by chance
+        (0.01, 0.4, 5, False),  # eight standard deviations off
+        (0.01, 0.1, 1, False),
+    ],
+)
+def test_with_a_prior_the_second_start_trusts_it_less(monkeypatch, loss_there, way_m, starts, kept):
+    information = jnp.eye(6) / 0.05**2
+
+    def find_step(sums, axes, anchor, *_):
+        lowered = anchor.information[0, 0] < 0.9 * information[0, 0]
+        return jnp.where(lowered, way_m / solving._COARSE_STEPS, 0) * jnp.eye(6)[0]
+
+    def sum_returns(field, rows, pose, scale_m):
+        loss = jnp.where(pose[0, 3] > 0, loss_there, 0.02)
+        values = jnp.zeros(31).at[27].set(loss * len(rows.some)).at[28].set(len(rows.some))
+        return comparing.Sums(values.astype(jnp.float32))
+
+    monkeypatch.setattr(solving, "find_step", find_step)
+    monkeypatch.setattr(solving, "sum_returns", sum_returns)
+    anchor = equations.Anchor(jnp.eye(4), information)
+    pose, _ = solving.solve_coarse(None, ROWS, jnp.eye(4), anchor, 0.7, starts)
+    # The last step to it lowers the information by half.
+    np.testing.assert_allclose(pose[:3, 3], [way_m if kept else 0, 0, 0], atol=1e-6)
+
+
 def test_other_starts_are_15_cm_and_6_degrees_away_in_all_directions():
     ways, turns = solving._OTHER_STARTS[:, :3], solving._OTHER_STARTS[:, 3:]
     np.testing.assert_allclose(np.linalg.norm(ways, axis=1), 0.15, rtol=1e-6)
@@ -172,8 +201,8 @@ def test_a_start_that_ends_nowhere_gives_way_to_others(monkeypatch):
     [
         (lambda *given: hio.refine_pose(*given), 5),
         (lambda *given: hio.refine_pose(*given, starts=2), 2),
-        (lambda *given: hio.refine_pose(*given, prior=(np.eye(4), np.eye(6))), 1),
-        (lambda *given: hio.track(*given), 1),
+        (lambda *given: hio.refine_pose(*given, prior=(np.eye(4), np.eye(6))), 5),
+        (lambda *given: hio.track(*given), 5),
     ],
 )
 def test_starts_that_each_function_asks_for(monkeypatch, empty_map, call, expected):

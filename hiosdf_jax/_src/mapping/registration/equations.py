@@ -32,7 +32,7 @@ from hiosdf_jax._src.state import Baked, Field
 # turns the normals of patches. In maps of corridors it grows by at most 0.0035 along them, and in a
 # furnished house by at least 0.0069. A baked field does not know how noisy it is.
 _TRIED_M = 0.2
-_LEAST_GROWTH = 0.004
+LEAST_GROWTH = 0.004
 _LEAST_GROWTH_BAKED = 0.01
 
 # This many of the least determined directions are tried: a plane leaves three free.
@@ -125,7 +125,7 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
     # All at once would need much memory where XLA makes arrays of all that leads to the losses.
     at_once = devices.has_kernels() and isinstance(field, Field)
     grown = (jax.vmap(growth)(ways) if at_once else jax.lax.map(growth, ways)).reshape(2, -1)
-    least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
+    least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else LEAST_GROWTH
     free = ~(jnp.min(grown, axis=0) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
     return Directions(basis, free | ~jnp.any(here.comparable))
@@ -152,15 +152,17 @@ def fit_of(sums: Sums, some: jax.Array) -> Fit:
     return Fit(mean, sums.known / jnp.maximum(count, 1).astype(jnp.float32))
 
 
-def fits_better(one: Fit, other: Fit) -> jax.Array:
+def fits_better(one: Fit, other: Fit, least: jax.Array | float = 0.0) -> jax.Array:
     """Returns whether a cloud fits better in one pose than in another, () bool.
+
+    The mean loss must differ by more than `least`.
 
     A return about which the map tells nothing counts more than a known one in the worse pose. So no
     pose is better because fewer returns can be compared there.
     """
     unknown = jnp.maximum(one.loss, other.loss) + _UNKNOWN_MORE
     first, second = (fit.known * fit.loss + (1 - fit.known) * unknown for fit in (one, other))
-    return jnp.where(jnp.isfinite(unknown), first < second, one.loss < other.loss)
+    return jnp.where(jnp.isfinite(unknown), first < second - least, one.loss < other.loss)
 
 
 def turn(matrix: jax.Array, directions: Directions) -> jax.Array:

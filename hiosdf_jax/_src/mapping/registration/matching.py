@@ -43,9 +43,10 @@ _BACK_VOXELS = 0.5
 
 # A return from the other side of a surface without solid voxels behind it lies off its patches by
 # the thickness of the thing, such as a tabletop. That is anything up to a voxel; here its standard
-# deviation. Without it the 95 % error of poses in the house is 1.1 instead of 0.8 cm. In a map that
-# grows more than by half, the side that the sensor sees may be missing. There such returns are left
-# out: they would pull a cloud through a wall by its thickness.
+# deviation. Without it the 95 % error of poses in the house is 1.1 instead of 0.8 cm.
+# In a map that grows, the side that the sensor sees may be missing. Where `Rows.growing` exceeds
+# the second value, such returns are left out: they would pull a cloud through a wall by its
+# thickness.
 _THICKNESS_VOXELS = 12**-0.5
 _GROWS = 0.5
 

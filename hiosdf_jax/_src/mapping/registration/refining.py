@@ -83,7 +83,7 @@ def refine_pose(
     """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
 
     Gauss-Newton steps on the distances, with weights that outliers lose. The pose may be 15 cm
-    and 6 degrees off. Where the cloud does not fit in the end, the steps begin again nearby. Pure:
+    and 6 degrees off. Where the cloud does not fit in the end, the steps begin again. Pure:
     works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field, the cloud and the prior;
     see docs/poses.md.
 
@@ -101,8 +101,8 @@ def refine_pose(
             `track` takes 0.2. With a smaller reach outliers also lose their weight sooner.
         starts: Most poses to begin from, 1 to 5, not traced: the given one, and others 15 cm and 6
             degrees away as long as the cloud does not fit; nearer ones with a smaller reach. With a
-            prior, only the given one. Take 1 to compare many poses: under `vmap` each takes as many
-            starts as the worst one.
+            prior, at most two: both at the given pose, the second with less trust in the prior.
+            Take 1 to compare many poses: under `vmap` each takes as many starts as the worst one.
 
     Returns:
         The refined pose, and how far it can be trusted.
@@ -123,7 +123,7 @@ def refine_pose(
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
     check_whole("starts", starts, 1, MOST_STARTS)
-    most = np.asarray(1 if prior is not None else starts, np.int32)
+    most = np.asarray(starts, np.int32)
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
     floats, some = cloud_and_returns(cloud)

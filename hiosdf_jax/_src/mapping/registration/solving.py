@@ -21,8 +21,10 @@ from hiosdf_jax._src.mapping.registration.comparing import (
     slope_of,
     sum_returns,
     take_evenly,
+    units,
 )
 from hiosdf_jax._src.mapping.registration.equations import (
+    LEAST_GROWTH,
     Anchor,
     Directions,
     Fit,
@@ -32,7 +34,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     fit_of,
     fits_better,
 )
-from hiosdf_jax._src.mapping.registration.motion import move, way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import motion_between, move, way_and_angle
 from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.mapping.registration.uncertainty import inflation_of
 from hiosdf_jax._src.numerics.small_matrices import product
@@ -64,10 +66,13 @@ _OTHER_STARTS = np.concatenate(
 # them more: noisy normals seem to constrain directions that the surfaces do not constrain.
 _COARSE_INFLATION = 16.0
 
-# A tolerance lowers the information of returns about as if they were this exact without it, m. That
-# of a prior is lowered alike. Otherwise the first steps keep a pose that is three of its deviations
-# off, and the last ones find a wrong minimum there.
+# A tolerance lowers the information of returns about as if they were this exact without it, m. In
+# the second start with a prior, that of the prior is lowered alike. Otherwise the first steps keep
+# a pose that is three of its deviations off, and the last ones find a wrong minimum there. The
+# second result is kept if the returns fit clearly better, up to this many deviations from the
+# prior.
 _COARSE_SIGMA_M = 0.02
+_MOST_DEVIATIONS = 6.0
 
 # Rows are selected where surfaces may be this far off, m: those that contradict a pose that is not
 # yet right must be among them. Fine steps begin with a smaller tolerance, m, and shrink it by a
@@ -117,7 +122,8 @@ def solve_coarse(
         anchor: What holds free directions.
         reach_m: How far surfaces may be from where they should be in the first step.
         starts: Most poses to begin from. Others around the given one are tried as long as the
-            returns do not fit.
+            returns do not fit. With a prior there are at most two. Both are the given pose, and the
+            second one trusts the prior less.
 
     Returns:
         The pose (4, 4) at which the returns fit best, and `Rows.share` as measured before the last
@@ -127,16 +133,21 @@ def solve_coarse(
     shrink = _COARSE_END_M / reach_m
     size = jnp.minimum(reach_m / COMPLETE_REACH_M, 1)
     motions = size * jnp.concatenate([jnp.zeros((1, 6), jnp.float32), _OTHER_STARTS])
+    has_prior = anchor.information is not None
+    if has_prior:
+        motions, starts = jnp.zeros((2, 6), jnp.float32), jnp.minimum(starts, 2)
     unknown = Fit(jnp.float32(jnp.inf), jnp.float32(0))
 
-    def step(i: jax.Array, carry: tuple[jax.Array, Sums]) -> tuple[jax.Array, Sums]:
+    def step(
+        number: jax.Array, i: jax.Array, carry: tuple[jax.Array, Sums]
+    ) -> tuple[jax.Array, Sums]:
         pose, before = carry
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         # The first step takes planes, which narrow patches have, too.
         sums = sum_returns(field, few._replace(share=before.share), pose, scale_m)
         held = anchor
         if held.information is not None:
-            lower = 1 + (scale_m / _COARSE_SIGMA_M) ** 2
+            lower = jnp.where(number > 0, 1 + (scale_m / _COARSE_SIGMA_M) ** 2, 1)
             held = held._replace(information=held.information / lower)
         # Fine steps bring free directions back.
         motion = find_step(sums, None, held, few, pose, _COARSE_INFLATION, _DAMPING)
@@ -145,14 +156,17 @@ def solve_coarse(
     def begin(carry: tuple[Any, Fit, jax.Array]) -> tuple[Any, Fit, jax.Array]:
         best, least, number = carry
         start = move(pose, motions[number]), no_sums()
-        found, sums = jax.lax.fori_loop(0, _COARSE_STEPS, step, start)
+        found, sums = jax.lax.fori_loop(0, _COARSE_STEPS, partial(step, number), start)
         fit = fit_of(sums, few.some)
         way, angle = way_and_angle(pose, found)
         most = _FARTHEST * size
         near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
+        if anchor.information is not None:
+            away = units(few) * motion_between(anchor.pose, found)
+            near = jnp.sum(away * product(anchor.information, away)) <= _MOST_DEVIATIONS**2
         usable = jnp.all(jnp.isfinite(found)) & ((number == 0) | near)
         fit = fit._replace(loss=jnp.where(usable, fit.loss, jnp.inf))
-        better = (number == 0) | fits_better(fit, least)
+        better = (number == 0) | fits_better(fit, least, LEAST_GROWTH if has_prior else 0.0)
         pick = partial(jnp.where, better)
         result = found, sums.share
         return *jax.tree.map(pick, (result, fit), (best, least)), number + 1
@@ -160,7 +174,7 @@ def solve_coarse(
     def continues(carry: tuple[Any, Fit, jax.Array]) -> jax.Array:
         _, least, number = carry
         fits = (least.loss <= _MOST_LOSS) & (least.known >= _LEAST_KNOWN)
-        return (number < starts) & ~fits
+        return (number < starts) & (has_prior | ~fits)
 
     first = (pose, few.share), unknown, jnp.int32(0)
     return jax.lax.while_loop(continues, begin, first)[0]
