@@ -158,10 +158,11 @@ def solve_coarse(
         start = move(pose, motions[number]), no_sums()
         found, sums = jax.lax.fori_loop(0, _COARSE_STEPS, partial(step, number), start)
         fit = fit_of(sums, few.some)
-        way, angle = way_and_angle(pose, found)
-        most = _FARTHEST * size
-        near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
-        if anchor.information is not None:
+        if anchor.information is None:
+            way, angle = way_and_angle(pose, found)
+            most = _FARTHEST * size
+            near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
+        else:
             away = units(few) * motion_between(anchor.pose, found)
             near = jnp.sum(away * product(anchor.information, away)) <= _MOST_DEVIATIONS**2
         usable = jnp.all(jnp.isfinite(found)) & ((number == 0) | near)
