@@ -1,11 +1,17 @@
-"""Small linear equations against numpy in float64."""
+"""Small linear equations and eigenvectors against numpy in float64."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import clear, interpret_point_kernels
 
-from hiosdf_jax._src.numerics.small_matrices import product, solve_positive
+from hiosdf_jax._src.numerics.small_matrices import (
+    eigenvectors,
+    inverse,
+    product,
+    solve_positive,
+)
 
 solve = jax.jit(solve_positive)
 
@@ -72,3 +78,61 @@ def test_the_derivative_is_that_of_the_inverse():
     turned = jax.grad(lambda v: jnp.sum(solve_positive(matrix, v) ** 2))(value)
     exact = 2 * np.linalg.solve(matrix.T, np.linalg.solve(matrix, value))
     np.testing.assert_allclose(turned, exact, rtol=1e-3)
+
+
+@pytest.fixture(scope="module", params=["library", "kernel"])
+def find(request):
+    """`eigenvectors` by a library, and by the kernel for GPUs interpreted on a CPU."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "kernel":
+            interpret_point_kernels(patch)
+        yield jax.jit(lambda matrix: eigenvectors(matrix))  # traced anew for each
+    clear()
+
+
+SPECIAL = {
+    "zero": np.zeros((6, 6)),
+    "unit": np.eye(6),
+    "rank 1": np.ones((6, 6)),
+    "diagonal": np.diag([3.0, 1, 2, 1, 0, 5]),
+    "far apart": np.diag([1e-30, 1e30, 1, 1, 0, 5]) + 1e-20,
+    "negative": -np.diag([3.0, 1, 2, 1, 0, 5]) - 1,
+}
+
+
+@pytest.mark.parametrize("condition", [1.5, 1e3, 1e6, *SPECIAL])
+def test_eigenvectors_turn_a_matrix_to_the_eigenvalues_of_numpy(find, condition):
+    matrices = SPECIAL[condition][None] if condition in SPECIAL else None
+    if matrices is None:
+        matrices = 1e4 * positive(5, 10, 6, condition)[0]
+    for matrix in matrices.astype(np.float32):
+        basis, exact = np.asarray(find(matrix), float), matrix.astype(float)
+        np.testing.assert_allclose(basis.T @ basis, np.eye(6), atol=2e-6)
+        expected = np.diag(np.linalg.eigvalsh(exact))
+        atol = 2e-6 * np.linalg.norm(exact)
+        np.testing.assert_allclose(basis.T @ exact @ basis, expected, atol=atol)
+
+
+def test_eigenvectors_of_a_batch_are_those_one_by_one(find):
+    matrices = positive(6, 5, 6, 100)[0].astype(np.float32)
+    together = np.asarray(jax.vmap(find)(matrices))
+    one_by_one = np.stack([find(matrix) for matrix in matrices])
+    np.testing.assert_allclose(together, one_by_one, atol=1e-5)
+
+
+@pytest.mark.parametrize("condition", [1, 1e2, 1e5])
+def test_inverses_are_those_of_numpy(condition):
+    for matrix in positive(7, 20, 6, condition)[0].astype(np.float32):
+        expected = np.linalg.inv(matrix.astype(float))
+        error = np.linalg.norm(np.asarray(inverse(matrix)) - expected) / np.linalg.norm(expected)
+        assert error < 3e-6 * condition
+
+
+def test_the_inverse_of_a_singular_matrix_is_finite_and_large():
+    """A direction about which nothing is known must not seem to be known."""
+    vectors = np.linalg.qr(np.random.default_rng(8).normal(size=(6, 6)))[0]
+    values = np.array([1, 1, 1, 1, 1, 0.0])
+    matrix = (vectors * values @ vectors.T).astype(np.float32)
+    found = np.asarray(inverse(matrix), float)
+    assert np.isfinite(found).all()
+    assert np.linalg.norm(found @ vectors[:, 5]) > 1e5

@@ -24,7 +24,13 @@ from hiosdf_jax._src.mapping.registration.comparing import (
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move
 from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.point_kernel import by_points
-from hiosdf_jax._src.numerics.small_matrices import product, solve_entries, solve_positive
+from hiosdf_jax._src.numerics.small_matrices import (
+    eigenvectors,
+    inverse,
+    product,
+    solve_entries,
+    solve_positive,
+)
 from hiosdf_jax._src.state import Baked, Field
 
 # A direction is free if the returns fit about as well where they are moved this far along it, m: if
@@ -111,7 +117,7 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
     total = sum_in_cells(values, here.points_world, _CELL_M)
     count = total[:, :1]
     mean = total[:, 1:] / jnp.maximum(count, 1e-9)
-    _, basis = jnp.linalg.eigh(jnp.matmul(mean.T, count * mean, precision="highest"))
+    basis = eigenvectors(jnp.matmul(mean.T, count * mean, precision="highest"))
 
     def growth(motion: jax.Array) -> jax.Array:
         there = compare(field, rows, move(pose, motion), 0.0)
@@ -257,7 +263,7 @@ def _free_step_at(damping: float, tables: Any, length: Any, sums: Any) -> tuple[
 def invert(matrix: jax.Array) -> jax.Array:
     """Inverts a positive definite matrix whose rows differ by many orders of magnitude."""
     size = sizes(matrix)
-    return size[:, None] * jnp.linalg.inv(size[:, None] * matrix * size) * size
+    return size[:, None] * inverse(size[:, None] * matrix * size) * size
 
 
 def sizes(matrix: jax.Array) -> jax.Array:

@@ -20,7 +20,11 @@ from hiosdf_jax._src.mapping.registration.comparing import (
 from hiosdf_jax._src.mapping.registration.equations import Anchor
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
-from hiosdf_jax._src.mapping.registration.selection import draw_evenly, take_evenly_on_host
+from hiosdf_jax._src.mapping.registration.selection import (
+    draw_evenly,
+    returns_beyond,
+    take_evenly_on_host,
+)
 from hiosdf_jax._src.mapping.registration.solving import (
     COMPLETE_REACH_M,
     MOST_STARTS,
@@ -38,6 +42,7 @@ from hiosdf_jax._src.numerics.intake import (
     check_covariance,
     check_pose,
     check_whole,
+    checked_cloud,
     cloud_and_returns,
     is_traced,
 )
@@ -126,11 +131,10 @@ def refine_pose(
     most = np.asarray(starts, np.int32)
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
-    floats, some = cloud_and_returns(cloud)
-    if isinstance(field, Field):
-        with np.errstate(over="ignore"):
-            x, y, z = (floats * floats).T
-            some &= x + y + z >= np.float32(field.config.min_range**2)
+    floats = checked_cloud(cloud)
+    some = returns_beyond(floats, field.config.min_range if isinstance(field, Field) else 0)
+    if not some.any():
+        cloud_and_returns(floats)  # refuses a cloud without a finite row
     # Here rather than on the device: less is moved there, and all clouds share one compilation.
     candidates = take_evenly_on_host(floats, some, _CANDIDATES)
     checked = check_pose(pose)
@@ -178,7 +182,7 @@ def _refine(
     verdict = judge(still, frozen, found)
     finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
     own = take_rows(rows, index)._replace(share=chosen.share)
-    exact = differentiable(field, own, found, directions, anchor, inflation)
+    exact = differentiable(field, own, anchor, found, directions, inflation)
     return Registration(
         pose=jnp.where(finite, exact, pose),
         covariance=covariance,

@@ -34,6 +34,14 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     return jnp.where(some[:, None], cloud[row], 0), some
 
 
+def returns_beyond(cloud: np.ndarray, range_m: float) -> np.ndarray:
+    """Returns a mask (N,) of the rows of a cloud (N, 3) that are returns, not nearer than this."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        # A product of matrices takes half the time of sums of columns.
+        square = (cloud * cloud) @ np.ones(3, np.float32)
+        return (square >= np.float32(range_m**2)) & (square < np.inf)
+
+
 def take_evenly_on_host(cloud: np.ndarray, some: np.ndarray, count: int) -> np.ndarray:
     """Selects the rows that `draw_evenly` selects.
 
@@ -49,8 +57,10 @@ def take_evenly_on_host(cloud: np.ndarray, some: np.ndarray, count: int) -> np.n
     total = len(cloud) if returns is None else len(returns)
     share = max(np.float32(total) / np.float32(count), np.float32(1))
     rank = (np.arange(min(total, count), dtype=np.float32) * share).astype(np.int32)
-    result = np.full((count, 3), np.nan, np.float32)
-    result[: len(rank)] = cloud.take(rank if returns is None else returns[rank], axis=0)
+    rows = rank if returns is None else returns.take(rank)
+    result = np.empty((count, 3), np.float32)
+    np.take(cloud, rows, axis=0, out=result[: len(rows)], mode="clip")  # "raise" copies twice
+    result[len(rows) :] = np.nan
     return result
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -37,7 +37,10 @@ from hiosdf_jax._src.mapping.registration.equations import (
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move, way_and_angle
 from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.mapping.registration.uncertainty import inflation_of
+from hiosdf_jax._src.numerics.loops import rounds_per_step
+from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.small_matrices import product
+from hiosdf_jax._src.numerics.tangents import all_zero, instantiate
 from hiosdf_jax._src.state import Baked, Field
 
 # Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
@@ -156,7 +159,9 @@ def solve_coarse(
     def begin(carry: tuple[Any, Fit, jax.Array]) -> tuple[Any, Fit, jax.Array]:
         best, least, number = carry
         start = move(pose, motions[number]), no_sums()
-        found, sums = jax.lax.fori_loop(0, _COARSE_STEPS, partial(step, number), start)
+        found, sums = jax.lax.fori_loop(
+            0, _COARSE_STEPS, partial(step, number), start, unroll=rounds_per_step()
+        )
         fit = fit_of(sums, few.some)
         if anchor.information is None:
             way, angle = way_and_angle(pose, found)
@@ -298,7 +303,9 @@ def _rest(
         def one(more: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple:
             return step(count + more, carry)
 
-        pose, way = jax.lax.fori_loop(0, _STEPS_AT_ONCE, one, (pose, way))
+        pose, way = jax.lax.fori_loop(
+            0, _STEPS_AT_ONCE, one, (pose, way), unroll=rounds_per_step(_STEPS_AT_ONCE)
+        )
         return pose, way, count + _STEPS_AT_ONCE
 
     def continues(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
@@ -310,13 +317,14 @@ def _rest(
     return pose, way <= _RESTING_M
 
 
+@jax.custom_jvp
 def differentiable(
     field: Field | Baked,
     rows: Rows,
+    anchor: Anchor,
     pose: jax.Array,
     directions: Directions,
-    anchor: Anchor,
-    inflation: jax.Array | float,
+    inflation: jax.Array,
 ) -> jax.Array:
     """Gives a solution its derivatives by the map, the returns and the anchor.
 
@@ -327,28 +335,39 @@ def differentiable(
     Args:
         field: The map.
         rows: The returns.
+        anchor: What holds free directions.
         pose: (4, 4), the solution.
         directions: Principal directions, some of them free.
-        anchor: What holds free directions.
         inflation: As in `Solution`.
 
     Returns:
         The pose.
     """
+    # `jax.lax.custom_root` does the same, but jax 0.11 takes 1 ms longer to start what contains it.
+    return pose
 
-    def unbalance(motion: jax.Array) -> jax.Array:
+
+@partial(differentiable.defjvp, symbolic_zeros=True)
+@plain
+def _(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    *given, pose, directions, inflation = primals
+    still = jnp.zeros(6, jnp.float32)
+
+    def unbalance(motion: jax.Array, given: Sequence[Any]) -> jax.Array:
+        field, rows, anchor = given
         moved = move(pose, motion)
         slope = slope_of(compare(field, rows, moved, 0.0)) / inflation
         return balance(directions, slope, anchor, rows, moved)
 
-    def solve_linear(linear: Callable, value: jax.Array) -> jax.Array:
-        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(6, dtype=jnp.float32))
-        # Rows of free directions are many orders smaller than others.
-        size = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-12)
-        return jnp.linalg.solve(size[:, None] * matrix, size * value)
+    def change_by(k: int) -> jax.Array:
+        def by_one(value: Any) -> jax.Array:
+            return unbalance(still, [*given[:k], value, *given[k + 1 :]])
 
-    def stay(_: Callable, start: jax.Array) -> jax.Array:
-        return start
+        return jax.jvp(by_one, (given[k],), (instantiate(given[k], tangents[k]),))[1]
 
-    motion = jax.lax.custom_root(unbalance, jnp.zeros(6, jnp.float32), stay, solve_linear)
-    return move(pose, motion)
+    change = sum((change_by(k) for k in range(3) if not all_zero(tangents[k])), start=still)
+    matrix = jax.jacfwd(unbalance)(still, given)
+    # Rows of free directions are many orders smaller than others.
+    size = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-12)
+    motion = -jnp.linalg.solve(size[:, None] * matrix, size * change)
+    return jax.jvp(partial(move, pose), (still,), (motion,))
