@@ -17,6 +17,7 @@ import numpy as np
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 
 _DEEPEST = 16  # an array has three axes or four
+_NESTED = list, tuple  # `list | tuple` would be made anew for each of the leaves of a map
 _MOST_WHOLE = 2**31 - 1  # a loop counts in int32
 
 
@@ -298,8 +299,8 @@ def _leaves(values: Any) -> list[Any]:
     """The members of nested lists and tuples."""
     found, inner = [], [values]
     for _ in range(_DEEPEST):
-        found += [value for value in inner if not isinstance(value, list | tuple)]
-        inner = [each for value in inner if isinstance(value, list | tuple) for each in value]
+        found += [value for value in inner if not isinstance(value, _NESTED)]
+        inner = [each for value in inner if isinstance(value, _NESTED) for each in value]
         if not inner:
             return found
     raise ValueError(f"lists are nested more than {_DEEPEST} deep, expected an array of numbers")
