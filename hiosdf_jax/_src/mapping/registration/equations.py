@@ -38,7 +38,7 @@ from hiosdf_jax._src.state import Baked, Field
 # turns the normals of patches. In maps of corridors it grows by at most 0.0035 along them, and in a
 # furnished house by at least 0.0069. A baked field does not know how noisy it is.
 _TRIED_M = 0.2
-LEAST_GROWTH = 0.004
+_LEAST_GROWTH = 0.004
 _LEAST_GROWTH_BAKED = 0.01
 
 # This many of the least determined directions are tried: a plane leaves three free.
@@ -131,7 +131,7 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
     # All at once would need much memory where XLA makes arrays of all that leads to the losses.
     at_once = devices.has_kernels() and isinstance(field, Field)
     grown = (jax.vmap(growth)(ways) if at_once else jax.lax.map(growth, ways)).reshape(2, -1)
-    least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else LEAST_GROWTH
+    least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
     free = ~(jnp.min(grown, axis=0) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
     return Directions(basis, free | ~jnp.any(here.comparable))
