@@ -273,6 +273,57 @@ def test_derivatives_by_the_cloud_are_finite_differences(room):
         assert abs(np.sum(slope * way) - change) < 0.01 * max(abs(change), 0.1 * size)
 
 
+@jax.jit
+def derivatives(field, cloud, pose, ways, weight):
+    """A score's gradient and second derivatives where cloud and field move; the pose is solved."""
+    none_free = equations.Directions(jnp.eye(6), jnp.zeros(6, bool))
+
+    def score(at):
+        some = jnp.isfinite(cloud[:, 0])
+        points = jnp.where(some[:, None], cloud + at[0] * ways[0], 0)
+        rows = comparing.make_rows(points, some, NOISE)
+        changed = field.replace(sdf=field.sdf + at[1] * ways[1])
+        anchor = equations.Anchor(pose, None)
+        solved = solving.differentiable(changed, rows, anchor, pose, none_free, jnp.float32(1))
+        return jnp.sum(weight * solved)
+
+    at, along = jnp.zeros(2), jnp.array([1.0, 0.0])
+    slope, curvature = jax.jvp(jax.grad(score), (at,), (along,))
+    return slope, jax.jvp(score, (at,), (along,))[1], curvature
+
+
+def test_derivatives_by_the_field_and_of_second_order_are_finite_differences(room):
+    rng = np.random.default_rng(4)
+    cloud, pose = room_cloud(9, COUNT, 0.2, (0.1, 0.0, 0.05))
+    world = cloud @ pose[:3, :3].T + pose[:3, 3]
+    near = np.sort(HALF - np.abs(world), axis=1)
+    cloud = np.where(near[:, 1:2] > 0.12, noisy(cloud, rng, 0.003), np.nan).astype(np.float32)
+    start = perturbed(pose, rng, 0.02, 1)
+    turned = np.nan_to_num(cloud) @ rng.normal(size=(3, 3)).astype(np.float32)
+    # Surfaces move along x.
+    shape = np.linspace(-1, 1, room.sdf.shape[0], dtype=np.float32)[:, None, None]
+    ways = turned, np.broadcast_to(shape, room.sdf.shape)
+    weight = rng.normal(size=(4, 4)).astype(np.float32)
+
+    def solve(cloud_way, field_way):
+        moved = cloud + np.float32(cloud_way) * ways[0]
+        changed = room.replace(sdf=room.sdf + np.float32(field_way) * ways[1])
+        return changed, moved, refine(changed, moved, start).pose
+
+    def score(*way):
+        return np.sum(weight * solve(*way)[2])
+
+    slope, forward, curvature = derivatives(*solve(0, 0), ways, weight)
+    np.testing.assert_allclose(forward, slope[0], rtol=1e-4)
+    step = 2e-3
+    by_cloud = (score(step, 0) - score(-step, 0)) / (2 * step)
+    by_field = (score(0, step) - score(0, -step)) / (2 * step)
+    np.testing.assert_allclose(slope, [by_cloud, by_field], rtol=0.02)
+    before, after = (derivatives(*solve(way, 0), ways, weight)[0] for way in (-step, step))
+    bend = (after - before) / (2 * step)
+    np.testing.assert_allclose(curvature, bend, rtol=0.1)
+
+
 def test_derivatives_by_the_prior_are_finite_differences(corridor):
     rng = np.random.default_rng(5)
     cloud = corridor_cloud(rng)
@@ -336,6 +387,7 @@ UNIT = np.eye(6)
         ({"field": 3}, "field is int"),
         ({"cloud": np.zeros((5, 2))}, r"cloud has shape \(5, 2\)"),
         ({"cloud": np.full((5, 3), np.nan)}, "cloud has no finite row"),
+        ({"cloud": np.full((5, 3), np.inf)}, "cloud has no finite row"),
         ({"pose": np.eye(3)}, "pose has shape"),
         ({"pose": BAD}, "^pose "),
         ({"prior": np.eye(4)}, "prior is "),

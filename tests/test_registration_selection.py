@@ -1,11 +1,14 @@
 """Which returns are selected."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from hiosdf_jax._src.mapping.registration.selection import (
+    are_returns,
     draw_evenly,
     draw_informative,
+    square_ranges_on_host,
     take_evenly_on_host,
 )
 
@@ -74,3 +77,25 @@ def test_the_host_draws_the_rows_that_the_device_draws(count, finite):
     drawn = np.asarray(expected)[np.asarray(is_row)]
     np.testing.assert_array_equal(found[: len(drawn)], drawn)
     assert np.isnan(found[len(drawn) :]).all()
+
+
+@pytest.mark.parametrize("least_range_m", [0.0, 0.1])
+def test_returns_are_finite_and_in_range(least_range_m):
+    inf, nan = np.inf, np.nan
+    rows = [
+        ((0, 0, 0), least_range_m == 0),
+        ((0, 0.0999, 0), least_range_m == 0),
+        ((0, 0, -0.1001), True),
+        ((-9e4, 0, 0), True),
+        ((0, 2e5, 0), False),
+        ((1e20, 0, 0), False),
+        ((0, nan, 1), False),
+        ((nan, inf, 1), False),
+        ((1, 1, -inf), False),
+    ]
+    cloud = np.array([row for row, _ in rows], np.float32)
+    expected = [is_return for _, is_return in rows]
+    square = square_ranges_on_host(cloud)
+    np.testing.assert_array_equal(are_returns(square, least_range_m), expected)
+    on_device = are_returns(jnp.sum(jnp.asarray(cloud) ** 2, axis=-1), least_range_m)
+    np.testing.assert_array_equal(on_device, expected)

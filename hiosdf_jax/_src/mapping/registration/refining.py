@@ -17,12 +17,13 @@ from hiosdf_jax._src.mapping.registration.comparing import (
     take_rows,
     units,
 )
-from hiosdf_jax._src.mapping.registration.equations import Anchor
+from hiosdf_jax._src.mapping.registration.equations import Anchor, invert
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import noise_of
 from hiosdf_jax._src.mapping.registration.selection import (
+    are_returns,
     draw_evenly,
-    returns_beyond,
+    square_ranges_on_host,
     take_evenly_on_host,
 )
 from hiosdf_jax._src.mapping.registration.solving import (
@@ -132,7 +133,7 @@ def refine_pose(
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
     floats = checked_cloud(cloud)
-    some = returns_beyond(floats, field.config.min_range if isinstance(field, Field) else 0)
+    some = are_returns(square_ranges_on_host(floats), _least_range_m(field))
     if not some.any():
         cloud_and_returns(floats)  # refuses a cloud without a finite row
     # Here rather than on the device: less is moved there, and all clouds share one compilation.
@@ -155,10 +156,8 @@ def _refine(
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
     if cloud.shape[0] == 0:
         cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
-    if isinstance(field, Field):  # nearer rows are no returns for `update`, either
-        near = jnp.sum(cloud**2, axis=-1) < field.config.min_range**2
-        cloud = jnp.where(near[:, None], jnp.nan, cloud)
-    points, some = draw_evenly(cloud, _CANDIDATES)
+    returns = are_returns(jnp.sum(cloud**2, axis=-1), _least_range_m(field))
+    points, some = draw_evenly(jnp.where(returns[:, None], cloud, jnp.nan), _CANDIDATES)
     floor, growth = noise_of(field) if noise is None else noise
     range_noise = jnp.float32(floor), jnp.float32(growth)
     growing = (COMPLETE_REACH_M - reach_m) / (COMPLETE_REACH_M - GROWING_REACH_M)
@@ -166,8 +165,9 @@ def _refine(
     anchor = Anchor(pose, None)
     if prior is not None:
         mean, covariance = (jnp.asarray(part, jnp.float32) for part in prior)
-        per_unit = units(rows)
-        anchor = Anchor(mean, jnp.linalg.inv(per_unit[:, None] * covariance * per_unit))
+        per_unit = 1 / units(rows)
+        symmetric = (covariance + covariance.T) / 2  # of which the inverse reads one half
+        anchor = Anchor(mean, per_unit[:, None] * invert(symmetric) * per_unit)
 
     still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
     begin = jax.lax.stop_gradient(pose)
@@ -193,6 +193,11 @@ def _refine(
 
 
 _refine_jit = jax.jit(_refine)
+
+
+def _least_range_m(field: Field | Baked) -> float:
+    """Nearer rows are no returns for `update`, either."""
+    return field.config.min_range if isinstance(field, Field) else 0.0
 
 
 def checked_reach(reach_m: Any) -> Any:

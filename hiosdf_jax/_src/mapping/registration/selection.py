@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.numerics.masks import count_below, running_sum
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
 # Share of the rows that are drawn evenly. The others are drawn by what they tell of the pose.
@@ -34,12 +37,24 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     return jnp.where(some[:, None], cloud[row], 0), some
 
 
-def returns_beyond(cloud: np.ndarray, range_m: float) -> np.ndarray:
-    """Returns a mask (N,) of the rows of a cloud (N, 3) that are returns, not nearer than this."""
+def square_ranges_on_host(cloud: np.ndarray) -> np.ndarray:
+    """Returns the squared ranges (N,) of the rows of a cloud (N, 3), m, or what is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         # A product of matrices takes half the time of sums of columns.
-        square = (cloud * cloud) @ np.ones(3, np.float32)
-        return (square >= np.float32(range_m**2)) & (square < np.inf)
+        return (cloud * cloud) @ np.ones(3, np.float32)
+
+
+def are_returns(square_ranges: Any, least_range_m: float) -> Any:
+    """Returns a mask of the rows that are returns.
+
+    Args:
+        square_ranges: (N,) m^2; what is not finite is no return, nor is a range above 100 km.
+        least_range_m: Nearer rows are no returns.
+
+    Returns:
+        (N,) bool.
+    """
+    return (square_ranges >= least_range_m**2) & (square_ranges < FARTHEST_M**2)
 
 
 def take_evenly_on_host(cloud: np.ndarray, some: np.ndarray, count: int) -> np.ndarray:
