@@ -246,14 +246,18 @@ def test_a_sure_prior_decides(room):
     np.testing.assert_allclose(found.pose, mean, atol=1e-4)
 
 
-def test_derivatives_by_the_cloud_are_finite_differences(room):
-    rng = np.random.default_rng(4)
+def smooth_frame(rng):
+    """A cloud away from the edges, where the distance has kinks, and a pose that is off."""
     cloud, pose = room_cloud(9, COUNT, 0.2, (0.1, 0.0, 0.05))
-    # Away from the edges, where the distance has kinks.
     world = cloud @ pose[:3, :3].T + pose[:3, 3]
     near = np.sort(HALF - np.abs(world), axis=1)
     cloud = np.where(near[:, 1:2] > 0.12, noisy(cloud, rng, 0.003), np.nan).astype(np.float32)
-    start = perturbed(pose, rng, 0.02, 1)
+    return cloud, perturbed(pose, rng, 0.02, 1)
+
+
+def test_derivatives_by_the_cloud_are_finite_differences(room):
+    rng = np.random.default_rng(4)
+    cloud, start = smooth_frame(rng)
     # Affine: of independent ways of 700 returns hardly anything would remain.
     affine = (
         rng.normal(size=(3, 3, 3)).astype(np.float32),
@@ -294,11 +298,7 @@ def derivatives(field, cloud, pose, ways, weight):
 
 def test_derivatives_by_the_field_and_of_second_order_are_finite_differences(room):
     rng = np.random.default_rng(4)
-    cloud, pose = room_cloud(9, COUNT, 0.2, (0.1, 0.0, 0.05))
-    world = cloud @ pose[:3, :3].T + pose[:3, 3]
-    near = np.sort(HALF - np.abs(world), axis=1)
-    cloud = np.where(near[:, 1:2] > 0.12, noisy(cloud, rng, 0.003), np.nan).astype(np.float32)
-    start = perturbed(pose, rng, 0.02, 1)
+    cloud, start = smooth_frame(rng)
     turned = np.nan_to_num(cloud) @ rng.normal(size=(3, 3)).astype(np.float32)
     # Surfaces move along x.
     shape = np.linspace(-1, 1, room.sdf.shape[0], dtype=np.float32)[:, None, None]
