@@ -90,7 +90,10 @@ def find(request):
     clear()
 
 
-SPECIAL = {
+MATRICES = {
+    "condition 1.5": 1e4 * positive(5, 10, 6, 1.5)[0],
+    "condition 1e3": 1e4 * positive(5, 10, 6, 1e3)[0],
+    "condition 1e6": 1e4 * positive(5, 10, 6, 1e6)[0],
     "zero": np.zeros((6, 6)),
     "unit": np.eye(6),
     "rank 1": np.ones((6, 6)),
@@ -100,12 +103,9 @@ SPECIAL = {
 }
 
 
-@pytest.mark.parametrize("condition", [1.5, 1e3, 1e6, *SPECIAL])
-def test_eigenvectors_turn_a_matrix_to_the_eigenvalues_of_numpy(find, condition):
-    matrices = SPECIAL[condition][None] if condition in SPECIAL else None
-    if matrices is None:
-        matrices = 1e4 * positive(5, 10, 6, condition)[0]
-    for matrix in matrices.astype(np.float32):
+@pytest.mark.parametrize("kind", MATRICES)
+def test_eigenvectors_turn_a_matrix_to_the_eigenvalues_of_numpy(find, kind):
+    for matrix in MATRICES[kind].reshape(-1, 6, 6).astype(np.float32):
         basis, exact = np.asarray(find(matrix), float), matrix.astype(float)
         np.testing.assert_allclose(basis.T @ basis, np.eye(6), atol=2e-6)
         expected = np.diag(np.linalg.eigvalsh(exact))

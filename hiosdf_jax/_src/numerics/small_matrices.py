@@ -155,15 +155,15 @@ def solve_entries(
     size = len(value)
     lower: dict[tuple[int, int], jax.Array] = {}
     scaled: dict[tuple[int, int], jax.Array] = {}  # lower[i, k] * pivot[k]
-    inverse, x = [], []
+    reciprocal, x = [], []  # of the pivots
     for j in range(size):
         pivot = matrix[j][j] - sum(scaled[j, k] * lower[j, k] for k in range(j))
-        inverse.append(1 / jnp.maximum(pivot, least_pivot * matrix[j][j]))
+        reciprocal.append(1 / jnp.maximum(pivot, least_pivot * matrix[j][j]))
         for i in range(j + 1, size):
             rest = sum(scaled[i, k] * lower[j, k] for k in range(j))
             scaled[i, j] = matrix[i][j] - rest
-            lower[i, j] = scaled[i, j] * inverse[j]
+            lower[i, j] = scaled[i, j] * reciprocal[j]
         x.append(value[j] - sum(lower[j, k] * x[k] for k in range(j)))
     for j in reversed(range(size)):
-        x[j] = x[j] * inverse[j] - sum(lower[i, j] * x[i] for i in range(j + 1, size))
+        x[j] = x[j] * reciprocal[j] - sum(lower[i, j] * x[i] for i in range(j + 1, size))
     return x
