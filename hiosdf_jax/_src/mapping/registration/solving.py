@@ -89,7 +89,7 @@ _FINE_SHRINK = 0.6
 _FINE_END_M = 0.004  # no tolerance below
 
 # The distance has kinks, around which whole steps may jump for ever: in a fifth of the frames of a
-# house, by up to 5 mm. After some of them, steps shrink to a half, a third, and so on.
+# house, by up to 5 mm. So the steps after the whole ones take a half, a third, and so on.
 _FINE_STEPS = 24
 _WHOLE_STEPS = 16
 
@@ -101,9 +101,9 @@ _FINE_ROWS = 4096
 # Steps end once one is shorter than this, m. Poses are then 0.01 mm from where they would rest.
 _FINISHED_M = 5e-5
 
-# Whether this is so is asked after this many steps: on a GPU the answer takes as long as a step. A
-# pose also rests if the mean of the last ones, before they shrink, is shorter than this, m. Each of
-# them may be longer, if they jump to and fro.
+# Whether one is so short is asked after this many steps: on a GPU the answer takes as long as a
+# step. A pose also rests if the mean vector of the last so many whole steps is at most this long,
+# m. Single ones may be longer, if they jump to and fro.
 _STEPS_AT_ONCE = 4
 _RESTING_M = 2e-3
 
@@ -225,7 +225,7 @@ class Solution(NamedTuple):
     Attributes:
         pose: (4, 4).
         residuals: The returns at this pose.
-        rests: The last step was short, () bool.
+        rests: The steps have come to rest, () bool.
         inflation: How many returns tell as much as one independent one would, ().
     """
 
@@ -283,8 +283,8 @@ class _Progress(NamedTuple):
 
     Attributes:
         pose: (4, 4).
-        way: Length of the last step, () m; infinite as long as there is a tolerance.
-        total: Sum of the last motions that were asked for, (6,).
+        way: Length of the last whole step, () m; infinite as long as there is a tolerance.
+        total: Sum of the whole steps since it was last asked whether the pose rests, (6,).
         count: Number of steps, () int32.
     """
 
@@ -308,6 +308,7 @@ def _rest(
     Returns:
         The pose (4, 4), and whether it rests, () bool.
     """
+    nothing = jnp.zeros(6, jnp.float32)
 
     def way_of(motion: jax.Array) -> jax.Array:
         return jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
@@ -334,7 +335,6 @@ def _rest(
     def continues(now: _Progress) -> jax.Array:
         return (now.count < _FINE_STEPS) & (now.way > _FINISHED_M)
 
-    nothing = jnp.zeros(6, jnp.float32)
     start = _Progress(pose, jnp.float32(jnp.inf), nothing, jnp.int32(0))
     end = jax.lax.while_loop(continues, steps, start)
     rests = (end.way <= _FINISHED_M) | (way_of(end.total) <= _STEPS_AT_ONCE * _RESTING_M)
