@@ -25,6 +25,11 @@ def frame():
     return cloud, pose, moved(pose, [0.02, -0.015, 0.01], [0.01, 0.0, -0.02])
 
 
+@jax.jit
+def track_all(state, clouds, poses):
+    return jax.lax.scan(lambda state, frame: hio.track(state, *frame), state, (clouds, poses))
+
+
 def foreign():
     """A cloud of another place."""
     return np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)
@@ -86,6 +91,16 @@ def test_a_young_map_takes_what_it_cannot_judge(empty_map):
     assert int(state.updates) == 5
 
 
+def test_a_young_map_takes_no_cloud_that_update_refuses(empty_map):
+    cloud, pose, _ = frame()
+    frames = [(cloud, np.full((4, 4), np.nan)), (cloud, np.diag([1, 1, -1, 1]))]
+    frames += [(np.zeros_like(cloud), pose), (cloud, pose)]
+    clouds, poses = (np.stack(part).astype(np.float32) for part in zip(*frames, strict=True))
+    state, found = track_all(empty_map, clouds, poses)
+    np.testing.assert_array_equal(found.converged, [False, False, False, True])
+    assert int(state.updates) == 1
+
+
 def test_scan_and_one_frame_after_another_agree(sharp_map):
     frames = [room_cloud(i, COUNT, 0.05 * i, (0.02 * i, 0.01 * i, 0.0)) for i in range(4)]
     clouds = np.stack([cloud for cloud, _ in frames])
@@ -99,9 +114,7 @@ def test_scan_and_one_frame_after_another_agree(sharp_map):
         founds.append(found)
     assert [bool(found.converged) for found in founds] == [True, False, True, True]
 
-    after, scanned = jax.lax.scan(
-        lambda state, frame: hio.track(state, *frame), sharp_map, (clouds, poses)
-    )
+    after, scanned = track_all(sharp_map, clouds, poses)
     np.testing.assert_array_equal(scanned.converged, [found.converged for found in founds])
     for k, found in enumerate(founds):
         # Whole-voxel steps of the field make poses rest within a millimeter, not at one point.
@@ -173,7 +186,7 @@ def test_wrong_input_is_named(empty_map):
     ]:
         with pytest.raises(ValueError, match=message):
             hio.track(*arguments)
-    with pytest.raises(ValueError, match="reach_m is 0, expected > 0"):
+    with pytest.raises(ValueError, match=r"reach_m is 0, expected >= 0\.001"):
         hio.track(empty_map, cloud, pose, reach_m=0)
     with pytest.raises(ValueError, match="before: pose is not rigid"):
         hio.predict_pose(pose, BAD, pose)

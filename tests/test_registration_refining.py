@@ -350,9 +350,63 @@ def test_a_cloud_of_another_place_is_not_registered(room):
     cloud = rng.normal(size=(COUNT, 3)).astype(np.float32)
     assert not bool(refine(room, cloud, np.eye(4, dtype=np.float32)).converged)
     far = moved(np.eye(4), [50, 0, 0], np.zeros(3))
-    lost = refine(room, room_cloud(0, COUNT)[0], far)
+    lost, slope = refine_and_slope(room, room_cloud(0, COUNT)[0], far, np.ones((4, 4), np.float32))
     assert not bool(lost.converged)
     np.testing.assert_allclose(lost.pose, far)
+    np.testing.assert_array_equal(slope, 0)
+
+
+@pytest.mark.parametrize("wrong", [np.full((4, 4), np.nan), np.diag([1, 1, -1, 1])])
+def test_inside_jit_a_pose_that_is_not_rigid_stays_and_has_no_derivatives(room, wrong):
+    cloud, _ = room_cloud(0, COUNT)
+    wrong, weight = wrong.astype(np.float32), np.ones((4, 4), np.float32)
+    found, slope = refine_and_slope(room, cloud, wrong, weight)
+    assert not bool(found.converged)
+    np.testing.assert_array_equal(found.pose, wrong)
+    np.testing.assert_array_equal(slope, 0)
+    eye, prior = np.eye(4, dtype=np.float32), np.eye(6, dtype=np.float32)
+    found, slope = refine_and_slope_with_prior(room, cloud, eye, wrong, prior, weight)
+    assert not bool(found.converged)
+    np.testing.assert_array_equal(slope, 0)
+
+
+def test_the_reach_has_a_gradient(room):
+    """It is zero, but a loop that ends early has none in reverse mode."""
+
+    def score(reach_m):
+        return jnp.sum(hio.refine_pose(room, np.ones((5, 3)), np.eye(4), reach_m=reach_m).pose)
+
+    assert jax.eval_shape(jax.grad(score), jnp.float32(0.7)).shape == ()
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.002, 0.01])
+@pytest.mark.parametrize(
+    ("along", "free"), [([1.0, 0.0, 0.0], 4), ([1.0, 0.0, 0.7], 4), ([0.0, 0.0, 0.0], 5)]
+)
+def test_a_line_or_a_point_of_returns_moves_only_onto_its_wall(corridor, along, free, sigma):
+    rng = np.random.default_rng(0)
+    cloud = np.array([0.2, 1.0, -0.1]) + rng.uniform(-0.5, 0.5, (COUNT, 1)) * along
+    cloud = noisy(cloud, rng, sigma)
+    start = moved(np.eye(4), [0.03, 0.04, -0.02], [0.01, 0.02, -0.015])
+    found = refine(corridor, cloud, start)
+    way = np.linalg.norm(error(found.pose, start)[:3])
+    assert way < 0.06 or not bool(found.converged)
+    rows = comparing.make_rows(jnp.asarray(cloud), jnp.ones(COUNT, bool), NOISE)
+    assert int(equations.find_directions(corridor, rows, np.eye(4)).free.sum()) == free
+
+
+def test_the_covariance_of_an_oblique_corridor_is_a_prior(corridor):
+    """In float32 it is singular: 100 m along the corridor, and millimeters across."""
+    rng = np.random.default_rng(10)
+    cloud = corridor_cloud(rng)
+    eye = np.eye(4, dtype=np.float32)
+    along_axes = refine(corridor, cloud, eye)
+    turn = np.kron(np.eye(2), Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix())
+    oblique = (turn @ np.asarray(along_axes.covariance, float) @ turn.T).astype(np.float32)
+    given = moved(eye, [0.02, 0.02, 0.0], np.zeros(3))
+    found = hio.refine_pose(corridor, cloud, given, (given, oblique), noise=NOISE)
+    assert np.isfinite(np.asarray(found.pose)).all()
+    assert abs(found.pose[1, 3]) < 3e-3
 
 
 def test_inside_jit_an_empty_cloud_keeps_the_pose(room):
@@ -392,6 +446,10 @@ UNIT = np.eye(6)
         ({"pose": BAD}, "^pose "),
         ({"prior": np.eye(4)}, "prior is "),
         ({"prior": (np.eye(4), np.eye(5))}, "prior has a mean of shape"),
+        ({"prior": (np.eye(4), [[1], [2, 3]])}, "prior covariance is no array of numbers"),
+        ({"prior": (np.eye(4), UNIT - 2 * np.eye(6, k=1) - 2 * np.eye(6, k=-1))}, "not positive"),
+        ({"prior": (np.eye(4), np.diag([1, 1, 1, 1, 1, 0]))}, "not positive definite"),
+        ({"reach_m": 1e-30}, "reach_m is 1e-30, expected >= 0.001"),
         ({"prior": (BAD, UNIT)}, "prior: pose "),
         ({"prior": (np.eye(4), -UNIT)}, "prior covariance is not positive definite"),
         ({"prior": (np.eye(4), UNIT + np.eye(6, k=1))}, "prior covariance is not symmetric"),
@@ -472,6 +530,11 @@ def test_a_pose_rests_by_the_length_of_its_whole_steps(monkeypatch, step_m, step
     assert made == steps
     parts = np.where(np.arange(steps) < 16, 1, 1 / np.maximum(np.arange(steps) - 14, 1))
     np.testing.assert_allclose(found.pose[0, 3], step_m * parts.sum(), rtol=1e-4)
+
+
+def test_a_pose_that_jumps_far_to_and_fro_does_not_rest(monkeypatch):
+    found, _ = solve_with_steps(monkeypatch, lambda x: jnp.where(x < 0.05, 0.1, -0.1))
+    assert not bool(found.rests)
 
 
 @pytest.mark.parametrize("kink_m", [0.0185, 0.0195, 0.02, 0.021, 0.0215])

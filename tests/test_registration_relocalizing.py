@@ -90,6 +90,25 @@ def test_the_place_is_found(seed):
     assert float(found.other_score) < float(found.score) - 0.03
 
 
+def test_rows_that_are_no_returns_change_nothing():
+    """A depth camera without an answer gives zeros."""
+    cloud, _ = view(0)
+    field, key = baked(furnished_distance), jax.random.key(0)
+    expected = hio.relocalize(field, cloud, key, HYPOTHESES)
+    more = np.zeros((2 * COUNT, 3), np.float32)
+    more[1::2] = cloud
+    more[::4] = [1e7, np.nan, 0]
+    found = hio.relocalize(field, more, key, HYPOTHESES)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_inside_jit_a_cloud_may_have_no_rows():
+    field, none = baked(furnished_distance), np.zeros((0, 3), np.float32)
+    found = jax.eval_shape(lambda cloud: hio.relocalize(field, cloud, jax.random.key(0), 256), none)
+    assert found.best.pose.shape == (4, 4)
+
+
 def test_a_symmetric_room_has_two_answers():
     cloud, pose = room_cloud(3, COUNT, 0.4, (0.2, 0.1, 0.05))
     found = hio.relocalize(baked(room_distance), cloud, jax.random.key(0), HYPOTHESES)
@@ -114,7 +133,7 @@ def test_a_sensor_that_is_mounted_askew():
         cloud @ mounted,
         jax.random.key(1),
         HYPOTHESES,
-        up_sensor=mounted.T @ [0, 0, 2.0],
+        up_sensor=mounted.T @ [0, 0, 2e-30],  # any length
     )
     expected = pose.copy()
     expected[:3, :3] = pose[:3, :3] @ mounted

@@ -164,6 +164,19 @@ def test_given_poses_of_unknown_accuracy_change_nothing():
         assert errors(smoothed[1:], exact[1:])[0] < 0.01
 
 
+def test_a_covariance_may_be_singular_to_rounding():
+    """100 m along a corridor that runs along no axis, and 1 cm across it."""
+    turn = np.kron(np.eye(2), Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix())
+    deviations = np.array([100, 0.01, 0.01, 0.01, 0.01, 0.01])
+    oblique = (turn * deviations**2 @ turn.T).astype(np.float32)
+    rng = np.random.default_rng(7)
+    exact = path(60)
+    given_poses, registered = noisy(exact, rng, 0.01, 0.01), drifting(exact, rng, 0.002, 0.0005)
+    smoothed = hio.smooth_poses(registered, given_poses, oblique)
+    way = (smoothed[:, :3, 3] - exact[:, :3, 3]) @ turn[:3, 1:3]
+    assert np.sqrt((way**2).sum(axis=1).mean()) < 0.01
+
+
 def test_each_pose_may_have_its_own_covariance():
     rng = np.random.default_rng(3)
     exact = path(20)
@@ -198,6 +211,7 @@ def test_no_poses_and_one_pose():
         ({"covariance": np.triu(np.ones((6, 6))) + np.eye(6)}, "covariance is not symmetric"),
         ({"covariance": np.stack([EQUAL, -EQUAL, EQUAL])}, r"covariance\[1\] is not positive"),
         ({"motion_deviation": (0.0, 1.0)}, "motion_deviation is 0.0"),
+        ({"motion_deviation": 0.1}, r"motion_deviation is 0.1, expected \(m, rad\)"),
         ({"motion_deviation": (0.1,)}, r"motion_deviation is \(0.1,\), expected \(m, rad\)"),
         ({"registered": [[True], []]}, "registered is no array"),
         ({"registered": [True]}, r"registered is bool \(1,\), expected bool \(3,\)"),

@@ -62,20 +62,22 @@ def track(
             m or rad, is refused.
 
     Returns:
-        The new map, and the registration. `converged` is False if the cloud was not to be fused.
-        Where it fits nowhere, the pose is the predicted one, and the covariance that of the prior,
-        or 100 m. The covariance of the first cloud is that of the prior, or 0: its pose defines
-        where the map is.
+        The new map, and the registration. `converged` is False if the cloud fits nowhere, or if a
+        young map refused it, such as one at a pose that is not finite. Then the pose is the
+        predicted one, and the covariance that of the prior, or 100 m. The covariance of the first
+        cloud is that of the prior, or 0: its pose defines where the map is.
 
     Raises:
         ValueError: As `refine_pose` and `update` do.
 
     Example:
-        >>> state, before = hio.track(state, *first)
-        >>> pose = before.pose
-        >>> for cloud in clouds:
-        ...     predicted = hio.predict_pose(pose, before.pose, pose)
-        ...     before, (state, found) = pose, hio.track(state, cloud, predicted)
+        >>> state, last = hio.track(state, clouds[0], odometry[0])
+        >>> reference = 0  # the last registered frame
+        >>> for i in range(1, len(clouds)):
+        ...     predicted = hio.predict_pose(last.pose, odometry[reference], odometry[i])
+        ...     state, found = hio.track(state, clouds[i], predicted)
+        ...     if found.converged:
+        ...         last, reference = found, i
     """
     check_map(state)
     _, checked_noise = check_extras(None, noise)
@@ -91,9 +93,13 @@ def track(
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
-    found, flags_so_far = _register_jit(state.updates, start, found, own, reach)
+    found, registered, flags_so_far = _register_jit(state.updates, start, found, own, reach)
+    updates_if_fused = state.updates + 1  # before `state` is donated
     extras, donate = (None, checked_noise), donate and not traced
-    return run_update(state, fused_cloud, found.pose, extras, flags_so_far, donate), found
+    state = run_update(state, fused_cloud, found.pose, extras, flags_so_far, donate)
+    # `update` may refuse what a young map takes on trust.
+    converged = _confirm_jit(found.converged, registered, state.updates, updates_if_fused)
+    return state, found._replace(converged=converged)
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
@@ -164,8 +170,12 @@ def _register(
     found: Registration,
     own: jax.Array | None,
     reach_m: jax.Array,
-) -> tuple[Registration, jax.Array]:
-    """Decides whether a cloud is fused, and where; also returns the flags that this raises."""
+) -> tuple[Registration, jax.Array, jax.Array]:
+    """Decides whether a cloud is fused, and where.
+
+    Returns:
+        The registration, whether the map determined it, and the flags that this raises.
+    """
     first = updates == 0
     near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
     registered = found.converged & near & ~first
@@ -178,7 +188,14 @@ def _register(
         covariance=jnp.where(registered, found.covariance, own),
         converged=fused,
     )
-    return chosen, jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
+    return chosen, registered, jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
 
 
 _register_jit = jax.jit(_register)
+
+
+@jax.jit
+def _confirm_jit(
+    fused: jax.Array, registered: jax.Array, updates: jax.Array, updates_if_fused: jax.Array
+) -> jax.Array:
+    return registered | (fused & (updates == updates_if_fused))

@@ -19,6 +19,8 @@ from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 _DEEPEST = 16  # an array has three axes or four
 _NESTED = list, tuple  # `list | tuple` would be made anew for each of the leaves of a map
 _MOST_WHOLE = 2**31 - 1  # a loop counts in int32
+_LEAST_VARIANCE = 1e-20  # of a pose, m^2 or rad^2; its square is a number of float32
+_ROUNDING = 1e-5  # of the eigenvalues of a correlation matrix (6, 6) in float32
 
 
 def as_real(name: str, values: Any) -> np.ndarray:
@@ -275,18 +277,21 @@ def check_covariance(name: str, covariance: np.ndarray) -> None:
         covariance: (6, 6), m and rad.
 
     Raises:
-        ValueError: The matrix is not finite, symmetric and positive definite.
+        ValueError: The matrix is not finite, symmetric and positive definite. One that is singular
+            to float32's rounding passes: a corridor that does not run along an axis has such a one.
     """
     exact = covariance.astype(np.float64)
     expected = "expected a symmetric, positive definite matrix, m and rad"
     if not np.isfinite(exact).all():
         raise ValueError(f"{name} has values that are not finite, {expected}")
+    if np.diag(exact).min() < _LEAST_VARIANCE:
+        raise ValueError(f"{name} is not positive definite, {expected}")
     # In units of each component's own deviation: those of meters and radians differ.
-    size = np.sqrt(np.maximum(np.diag(exact), 1e-30))
+    size = np.sqrt(np.diag(exact))
     scaled = exact / np.outer(size, size)
     if not np.allclose(scaled, scaled.T, atol=1e-3):
         raise ValueError(f"{name} is not symmetric, {expected}")
-    if np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] < 1e-5:
+    if np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] < -_ROUNDING:
         raise ValueError(f"{name} is not positive definite, {expected}")
 
 

@@ -41,8 +41,15 @@ _TRIED_M = 0.2
 _LEAST_GROWTH = 0.004
 _LEAST_GROWTH_BAKED = 0.01
 
-# This many of the least determined directions are tried: a plane leaves three free.
-_TRIED_DIRECTIONS = 3
+# This many of the least determined directions are tried: a plane leaves three free, a line four,
+# and a point five. The first three are free if the returns fit as well on one of the two sides. The
+# others must fit on both: in unseen space, for instance behind a wall, nothing contradicts.
+_TRIED_DIRECTIONS = 5
+_FREE_BY_ONE_SIDE = 3
+
+# With a smaller share of the information of the best determined direction, a direction is free: it
+# is a rounding error.
+_LEAST_SHARE = 1e-6
 
 LEAST_COMPARABLE = 0.1
 """Share of the returns that must lie where the map has observed."""
@@ -117,7 +124,9 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
     total = sum_in_cells(values, here.points_world, _CELL_M)
     count = total[:, :1]
     mean = total[:, 1:] / jnp.maximum(count, 1e-9)
-    basis = eigenvectors(jnp.matmul(mean.T, count * mean, precision="highest"))
+    information = jnp.matmul(mean.T, count * mean, precision="highest")
+    basis = eigenvectors(information)
+    told = jnp.sum(basis * product(information, basis), axis=0)
 
     def growth(motion: jax.Array) -> jax.Array:
         there = compare(field, rows, move(pose, motion), 0.0)
@@ -132,8 +141,11 @@ def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Direct
     at_once = devices.has_kernels() and isinstance(field, Field)
     grown = (jax.vmap(growth)(ways) if at_once else jax.lax.map(growth, ways)).reshape(2, -1)
     least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
-    free = ~(jnp.min(grown, axis=0) >= least)
+    number = np.arange(_TRIED_DIRECTIONS)
+    by_one = number < _FREE_BY_ONE_SIDE
+    free = ~(jnp.where(by_one, jnp.min(grown, axis=0), jnp.max(grown, axis=0)) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
+    free |= told < _LEAST_SHARE * jnp.max(told)
     return Directions(basis, free | ~jnp.any(here.comparable))
 
 

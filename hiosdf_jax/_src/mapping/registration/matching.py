@@ -242,3 +242,10 @@ def noise_of(field: Field | Baked) -> tuple[float, float]:
     if isinstance(field, Field):
         return field.config.range_noise
     return Config.range_noise
+
+
+def least_range_of(field: Field | Baked) -> float:
+    """Returns the least range of a return, m: as for the noise, that of a configuration."""
+    if isinstance(field, Field):
+        return field.config.min_range
+    return Config.min_range

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,12 +18,13 @@ from hiosdf_jax._src.mapping.registration.comparing import (
     take_rows,
     units,
 )
-from hiosdf_jax._src.mapping.registration.equations import Anchor, invert
+from hiosdf_jax._src.mapping.registration.equations import Anchor, Directions, invert
 from hiosdf_jax._src.mapping.registration.judging import judge
-from hiosdf_jax._src.mapping.registration.matching import noise_of
+from hiosdf_jax._src.mapping.registration.matching import least_range_of, noise_of
+from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.selection import (
     are_returns,
-    draw_evenly,
+    draw_returns,
     square_ranges_on_host,
     take_evenly_on_host,
 )
@@ -37,7 +39,7 @@ from hiosdf_jax._src.mapping.registration.solving import (
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
 from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
-    as_floats,
+    as_array,
     as_number,
     as_traced,
     check_covariance,
@@ -48,11 +50,14 @@ from hiosdf_jax._src.numerics.intake import (
     is_traced,
 )
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
 from hiosdf_jax._src.state import Baked, Field
 
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384
+
+_LEAST_REACH_M = 1e-3
 
 
 class Registration(NamedTuple):
@@ -102,9 +107,11 @@ def refine_pose(
             not determine stay as in `pose`.
         noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m. By
             default it is `Config.range_noise` of the map; of a baked field, the default's.
-        reach_m: How far surfaces may be from where they should be, m. The default suits a map that
-            is complete. In one that grows, a wrong surface may be nearer than one that is missing:
-            `track` takes 0.2. With a smaller reach outliers also lose their weight sooner.
+        reach_m: How far surfaces may be from where they should be, at least 0.001 m. The default
+            suits a map that is complete. In one that grows, a wrong surface may be nearer than one
+            that is missing: `track` takes 0.2. With a smaller reach outliers also lose their weight
+            sooner. Without a prior, a pose that ends farther from the given one, m or rad, has not
+            converged.
         starts: Most poses to begin from, 1 to 5, not traced: the given one, and others 15 cm and 6
             degrees away as long as the cloud does not fit; nearer ones with a smaller reach. With a
             prior, at most two: both at the given pose, the second with less trust in the prior.
@@ -133,7 +140,7 @@ def refine_pose(
     if is_traced(*jax.tree.leaves((field, prior, checked_noise, reach)), cloud, pose):
         return _refine(field, *as_traced(cloud, pose), prior, checked_noise, reach, most)
     floats = checked_cloud(cloud)
-    some = are_returns(square_ranges_on_host(floats), _least_range_m(field))
+    some = are_returns(square_ranges_on_host(floats), least_range_of(field))
     if not some.any():
         cloud_and_returns(floats)  # refuses a cloud without a finite row
     # Here rather than on the device: less is moved there, and all clouds share one compilation.
@@ -154,10 +161,7 @@ def _refine(
     starts: jax.Array | np.ndarray,
 ) -> Registration:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
-    if cloud.shape[0] == 0:
-        cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
-    returns = are_returns(jnp.sum(cloud**2, axis=-1), _least_range_m(field))
-    points, some = draw_evenly(jnp.where(returns[:, None], cloud, jnp.nan), _CANDIDATES)
+    points, some = draw_returns(cloud, least_range_of(field), _CANDIDATES)
     floor, growth = noise_of(field) if noise is None else noise
     range_noise = jnp.float32(floor), jnp.float32(growth)
     growing = (COMPLETE_REACH_M - reach_m) / (COMPLETE_REACH_M - GROWING_REACH_M)
@@ -170,7 +174,7 @@ def _refine(
         anchor = Anchor(mean, per_unit[:, None] * invert(symmetric) * per_unit)
 
     still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
-    begin = jax.lax.stop_gradient(pose)
+    begin, reach_m = jax.lax.stop_gradient((pose, reach_m))
     near, share = solve_coarse(still, frozen, begin, held, reach_m, starts)
     rows, frozen = rows._replace(share=share), frozen._replace(share=share)
     index, directions = select_rows(still, frozen, near)
@@ -180,30 +184,37 @@ def _refine(
     covariance = covariance_of(residuals, directions, held, rows)
 
     verdict = judge(still, frozen, found)
-    finite = jnp.all(jnp.isfinite(found)) & jnp.all(jnp.isfinite(covariance))
+    # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
+    near_start = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
+    near_start |= prior is not None
+    usable = is_rigid(found) & is_rigid(anchor.pose) & jnp.all(jnp.isfinite(covariance))
     own = take_rows(rows, index)._replace(share=chosen.share)
-    exact = differentiable(field, own, anchor, found, directions, inflation)
+    # What is not finite would make derivatives NaN, although no such pose is chosen.
+    solution, other = (anchor, found, directions, inflation), _any_solution(prior is not None)
+    exact = differentiable(field, own, *jax.tree.map(partial(jnp.where, usable), solution, other))
     return Registration(
-        pose=jnp.where(finite, exact, pose),
+        pose=jnp.where(usable, exact, pose),
         covariance=covariance,
         residual=verdict.residual,
         inliers=verdict.inliers,
-        converged=rests & verdict.fits & finite,
+        converged=rests & verdict.fits & usable & near_start,
     )
+
+
+def _any_solution(has_prior: bool) -> tuple[Anchor, jax.Array, Directions, jax.Array]:
+    """Returns finite arguments for `differentiable`."""
+    pose, axes = jnp.eye(4, dtype=jnp.float32), jnp.eye(6, dtype=jnp.float32)
+    anchor = Anchor(pose, axes if has_prior else None)
+    return anchor, pose, Directions(axes, jnp.zeros(6, bool)), jnp.ones((), jnp.float32)
 
 
 _refine_jit = jax.jit(_refine)
 
 
-def _least_range_m(field: Field | Baked) -> float:
-    """Nearer rows are no returns for `update`, either."""
-    return field.config.min_range if isinstance(field, Field) else 0.0
-
-
 def checked_reach(reach_m: Any) -> Any:
     """Checks the argument `reach_m`, of tracers only the shape, and returns it as () float32."""
     if not is_traced(reach_m):
-        return np.asarray(as_number("reach_m", reach_m, 0.0, above=True), np.float32)
+        return np.asarray(as_number("reach_m", reach_m, _LEAST_REACH_M), np.float32)
     if np.shape(reach_m) != ():
         raise ValueError(f"reach_m has shape {np.shape(reach_m)}, expected one number")
     return jnp.asarray(reach_m, jnp.float32)
@@ -217,6 +228,7 @@ def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
         mean, covariance = prior
     except (TypeError, ValueError):
         raise ValueError(f"prior is {prior!r}, expected (mean, covariance)") from None
+    mean, covariance = as_array("prior mean", mean), as_array("prior covariance", covariance)
     shapes = np.shape(mean), np.shape(covariance)
     if shapes != ((4, 4), (6, 6)):
         raise ValueError(
@@ -226,6 +238,5 @@ def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
     if not is_traced(mean):
         mean = check_pose(mean, "prior")
     if not is_traced(covariance):
-        covariance = as_floats("prior covariance", covariance)
-        check_covariance("prior covariance", covariance)
+        check_covariance("prior covariance", np.asarray(covariance))
     return jnp.asarray(mean, jnp.float32), jnp.asarray(covariance, jnp.float32)

@@ -26,10 +26,10 @@ from hiosdf_jax._src.mapping.registration.comparing import (
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.equations import Anchor
-from hiosdf_jax._src.mapping.registration.matching import noise_of
+from hiosdf_jax._src.mapping.registration.matching import least_range_of, noise_of
 from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
-from hiosdf_jax._src.mapping.registration.selection import draw_evenly
+from hiosdf_jax._src.mapping.registration.selection import draw_evenly, draw_returns
 from hiosdf_jax._src.mapping.registration.solving import solve_coarse
 from hiosdf_jax._src.numerics.intake import (
     as_array,
@@ -149,7 +149,7 @@ def relocalize(
         cloud, _ = as_traced(cloud, jnp.eye(4, dtype=jnp.float32))
     else:
         cloud, _ = cloud_and_returns(cloud)
-    points, some = _draw(cloud)
+    points, some = _draw(cloud, least_range_of(field))
     poses = _find_places(field, points, some, key, *ups, hypotheses)
     if traced:
         refined = jax.lax.map(lambda pose: refine_pose(field, cloud, pose, starts=1), poses)
@@ -163,18 +163,20 @@ def _direction(name: str, vector: Any) -> Any:
     array = as_array(name, vector)
     if np.shape(array) != (3,):
         raise ValueError(f"{name} has shape {np.shape(array)}, expected (3,)")
-    if not is_traced(array):
-        length = np.linalg.norm(np.asarray(array, float))
-        if not (np.isfinite(length) and length > 0):
-            raise ValueError(f"{name} is {vector!r}, expected a direction: finite and not zero")
-    return array
+    if is_traced(array):
+        return array
+    exact = np.asarray(array, float)
+    length = np.linalg.norm(exact)
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError(f"{name} is {vector!r}, expected a direction: finite and not zero")
+    return (exact / length).astype(np.float32)
 
 
-@jax.jit
+@jax.jit(static_argnums=1)
 @plain
-def _draw(cloud: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _draw(cloud: jax.Array, least_range_m: float) -> tuple[jax.Array, jax.Array]:
     """Draws as many returns as scores need; fewer are padded, so that all clouds have one shape."""
-    points, some = draw_evenly(cloud, _SCORED_ROWS)
+    points, some = draw_returns(cloud, least_range_m, _SCORED_ROWS)
     missing = _SCORED_ROWS - some.shape[0]
     return jnp.pad(points, ((0, missing), (0, 0))), jnp.pad(some, (0, missing))
 

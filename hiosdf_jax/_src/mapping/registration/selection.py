@@ -37,6 +37,14 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     return jnp.where(some[:, None], cloud[row], 0), some
 
 
+def draw_returns(cloud: jax.Array, least_range_m: float, count: int) -> tuple[jax.Array, jax.Array]:
+    """Selects returns as `draw_evenly` does; a cloud (N, 3), m, may be empty."""
+    if cloud.shape[0] == 0:
+        cloud = jnp.full((1, 3), jnp.nan, jnp.float32)
+    returns = are_returns(jnp.sum(cloud**2, axis=-1), least_range_m)
+    return draw_evenly(jnp.where(returns[:, None], cloud, jnp.nan), count)
+
+
 def square_ranges_on_host(cloud: np.ndarray) -> np.ndarray:
     """Returns the squared ranges (N,) of the rows of a cloud (N, 3), m, or what is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):

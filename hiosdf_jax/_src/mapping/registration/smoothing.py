@@ -18,6 +18,9 @@ from hiosdf_jax._src.numerics.intake import (
 # normal equations are singular to rounding.
 _MOST_DEVIATION = 1000.0
 
+# Eigenvalues of a correlation matrix below this are rounding errors of float32.
+_LEAST_EIGENVALUE = 1e-7
+
 
 def smooth_poses(
     poses: Any,
@@ -71,9 +74,9 @@ def smooth_poses(
     given = _check_poses("given_poses", given_poses, len(start))
     weights = _weights_of(covariance, len(given))
     known = _check_registered(registered, len(given))
+    if as_real("motion_deviation", motion_deviation).shape != (2,):
+        raise ValueError(f"motion_deviation is {motion_deviation!r}, expected (m, rad)")
     deviation = [as_number("motion_deviation", each, 0, above=True) for each in motion_deviation]
-    if len(deviation) != 2:
-        raise ValueError(f"motion_deviation is {motion_deviation}, expected (m, rad)")
     if len(given) == 0:
         return np.zeros((0, 4, 4), np.float32)
     return fit_chain(start, known, given, weights, np.repeat(deviation, 3)).astype(np.float32)
@@ -115,6 +118,11 @@ def _weights_of(covariance: Any, count: int) -> np.ndarray:
             check_covariance(f"covariance[{i}]", each)
     else:
         raise ValueError(f"covariance has shape {array.shape}, expected (6, 6) or ({count}, 6, 6)")
-    information = np.linalg.inv(array) + np.eye(6) / _MOST_DEVIATION**2
-    root = np.linalg.cholesky((information + np.swapaxes(information, -1, -2)) / 2)
+    size = np.sqrt(np.diagonal(array, axis1=-2, axis2=-1))
+    scaled = array / (size[..., :, None] * size[..., None, :])
+    values, vectors = np.linalg.eigh((scaled + np.swapaxes(scaled, -1, -2)) / 2)
+    roots = np.swapaxes(vectors, -1, -2) / size[..., None, :]
+    roots /= np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))[..., None]
+    information = np.swapaxes(roots, -1, -2) @ roots + np.eye(6) / _MOST_DEVIATION**2
+    root = np.linalg.cholesky(information)
     return np.broadcast_to(np.swapaxes(root, -1, -2), (count, 6, 6))

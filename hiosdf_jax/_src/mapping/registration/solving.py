@@ -103,9 +103,11 @@ _FINISHED_M = 5e-5
 
 # Whether one is so short is asked after this many steps: on a GPU the answer takes as long as a
 # step. A pose also rests if the mean vector of the last so many whole steps is at most this long,
-# m. Single ones may be longer, if they jump to and fro.
+# m. Single ones may be longer, if they jump to and fro, but not longer than the second value: none
+# around a kink was.
 _STEPS_AT_ONCE = 4
 _RESTING_M = 2e-3
+_LONGEST_JUMP_M = 0.01
 
 COMPLETE_REACH_M = 0.7
 """How far surfaces may be from where they should be, in a complete map."""
@@ -285,12 +287,14 @@ class _Progress(NamedTuple):
         pose: (4, 4).
         way: Length of the last whole step, () m; infinite as long as there is a tolerance.
         total: Sum of the whole steps since it was last asked whether the pose rests, (6,).
+        longest: Length of the longest of these steps, () m.
         count: Number of steps, () int32.
     """
 
     pose: jax.Array
     way: jax.Array
     total: jax.Array
+    longest: jax.Array
     count: jax.Array
 
 
@@ -318,16 +322,18 @@ def _rest(
         sums = sum_returns(field, rows, now.pose, jnp.where(scale_m > _FINE_END_M, scale_m, 0))
         motion = find_step(sums, directions, anchor, rows, now.pose, inflation)
         part = 1 / jnp.maximum(now.count - _WHOLE_STEPS + 2, 1).astype(jnp.float32)
+        way = way_of(motion)
         return _Progress(
             pose=move(now.pose, part * motion),
             # Exact comparisons alone say whether a pose rests.
-            way=jnp.where(scale_m > _FINE_END_M, jnp.inf, way_of(motion)),
+            way=jnp.where(scale_m > _FINE_END_M, jnp.inf, way),
             total=now.total + motion,
+            longest=jnp.maximum(now.longest, way),
             count=now.count + 1,
         )
 
     def steps(now: _Progress) -> _Progress:
-        now = now._replace(total=nothing)
+        now = now._replace(total=nothing, longest=jnp.float32(0))
         return jax.lax.fori_loop(
             0, _STEPS_AT_ONCE, step, now, unroll=rounds_per_step(_STEPS_AT_ONCE)
         )
@@ -335,10 +341,10 @@ def _rest(
     def continues(now: _Progress) -> jax.Array:
         return (now.count < _FINE_STEPS) & (now.way > _FINISHED_M)
 
-    start = _Progress(pose, jnp.float32(jnp.inf), nothing, jnp.int32(0))
+    start = _Progress(pose, jnp.float32(jnp.inf), nothing, jnp.float32(0), jnp.int32(0))
     end = jax.lax.while_loop(continues, steps, start)
-    rests = (end.way <= _FINISHED_M) | (way_of(end.total) <= _STEPS_AT_ONCE * _RESTING_M)
-    return end.pose, rests
+    slow = way_of(end.total) <= _STEPS_AT_ONCE * _RESTING_M
+    return end.pose, (end.way <= _FINISHED_M) | (slow & (end.longest <= _LONGEST_JUMP_M))
 
 
 @jax.custom_jvp
@@ -395,5 +401,8 @@ def _(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     matrix = jax.jacfwd(unbalance)(still, given)
     # Rows of free directions are many orders smaller than others.
     size = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-12)
-    motion = -jnp.linalg.solve(size[:, None] * matrix, size * change)
+    inverse = jnp.linalg.inv(size[:, None] * matrix)
+    # Where nothing determines the pose, it has no derivatives.
+    inverse = jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0)
+    motion = -product(inverse, size * change)
     return jax.jvp(partial(move, pose), (still,), (motion,))
