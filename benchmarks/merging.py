@@ -56,10 +56,16 @@ def map_frames(frames, bounds, max_range, motions):
     return state
 
 
-def score(name, state, truth):
+def score(name, state, truth, pose_map_world):
     """Scores a map, and prints a row of the table."""
     field = hio.snapshot(state)
-    scores = scoring.evaluate(lambda points: hio.sdf_and_grad(field, points), truth)
+    turn, shift = pose_map_world[:3, :3], pose_map_world[:3, 3]
+
+    def answer(points_world):
+        sdf, grad = hio.sdf_and_grad(field, (points_world @ turn.T + shift).astype(np.float32))
+        return sdf, grad @ turn
+
+    scores = scoring.evaluate(answer, truth)
     row = {column: records.rounded(float(scores[column]), 4) for column in COLUMNS}
     print(f"| {name} | " + " | ".join(f"{value:g}" for value in row.values()) + " |", flush=True)
     return row
@@ -77,8 +83,8 @@ def main():
     count, eye = len(frames), np.eye(4)
     rows = {}
 
-    def add(name, state):
-        rows[name] = score(name, state, truth)
+    def add(name, state, pose_map_world=eye):
+        rows[name] = score(name, state, truth, pose_map_world)
 
     print("| | " + " | ".join(COLUMNS) + " |\n" + "| --- " * (len(COLUMNS) + 1) + "|")
     one = map_frames(frames, bounds, max_range, [eye] * count)
@@ -94,6 +100,7 @@ def main():
     box = box_around(bounds, turn)
     second = map_frames(frames[half:], box, max_range, [turn] * (count - half))
     add("the same, one turned", hio.merge(first, second, np.linalg.inv(turn)))
+    add("one pass in that frame", map_frames(frames, box, max_range, [turn] * count), turn)
 
     wide = np.add(bounds, [[-0.6] * 3, [0.6] * 3])
     submaps, drifts, motions = [], [], []

@@ -10,7 +10,7 @@ from room_files import BOX, use_room_config
 from scipy.spatial.transform import Rotation
 
 from hiosdf_jax._src.command import cli, map_stream
-from hiosdf_jax._src.command.tracker import TRAJECTORY
+from hiosdf_jax._src.command.tracker import TRAJECTORY, without_flips
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
 
 FRAMES = 15
@@ -51,6 +51,16 @@ def drifting(poses):
         pose[:3, :3] = Rotation.from_rotvec([0, 0, np.radians(0.5 * k)]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += [0.01 * k, 0, 0]
     return result
+
+
+def test_quaternions_of_a_trajectory_have_no_flips():
+    """A sensor that turns twice about itself."""
+    angles = np.linspace(0, 4 * np.pi, 50)
+    exact = np.stack([0 * angles, 0 * angles, np.sin(angles / 2), np.cos(angles / 2)], axis=1)
+    flipped = exact * np.random.default_rng(0).choice([-1, 1], (50, 1))
+    found = without_flips(flipped)
+    np.testing.assert_allclose(found * np.sign(found[0] @ exact[0]), exact)
+    assert without_flips(exact[:1]).shape == (1, 4)
 
 
 def way_cm(poses, exact):

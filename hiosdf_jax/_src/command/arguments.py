@@ -57,7 +57,7 @@ every tenth frame, which it is not given.
 A bad frame ends the mapping with exit code 2. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it after the
 current frame with exit code 130, 143 and 129; a second one ends it at once. In each case the map so
 far is scored, drawn and written, to --save or to checkpoint.npz in the folder. --resume continues
-it.
+it, but not with --refine-poses or --odometry: the file of a map has no poses.
 """
 
 _VIEW_EXAMPLES = """\

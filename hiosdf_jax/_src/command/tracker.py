@@ -105,7 +105,7 @@ class Tracker:
         )
         frame = np.array([each.frame for each in self.frames])
         registered = np.array([each.registered for each in self.frames])
-        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        quaternions = without_flips(Rotation.from_matrix(poses[:, :3, :3]).as_quat())
         rows = np.column_stack([frame, poses[:, :3, 3], quaternions])
         with replacing(folder / TRAJECTORY[0]) as file:
             np.savetxt(file, rows, "%.9g", header="frame tx ty tz qx qy qz qw")
@@ -130,3 +130,17 @@ class Tracker:
         if registered:
             self._reference = tracked
         return tracked.pose
+
+
+def without_flips(quaternions: np.ndarray) -> np.ndarray:
+    """Of the two quaternions of each rotation, takes the one nearer to that of the frame before.
+
+    Args:
+        quaternions: (F, 4).
+
+    Returns:
+        (F, 4).
+    """
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    signs = 1 - 2 * (np.cumsum(flips) % 2)
+    return np.concatenate([quaternions[:1], quaternions[1:] * signs[:, None]])
