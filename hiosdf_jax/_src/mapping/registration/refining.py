@@ -187,7 +187,9 @@ def _refine(
     # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
     near_start = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
     near_start |= prior is not None
-    usable = is_rigid(found) & is_rigid(anchor.pose) & jnp.all(jnp.isfinite(covariance))
+    usable = is_rigid(found) & jnp.all(jnp.isfinite(covariance))
+    if prior is not None:
+        usable &= is_rigid(prior[0])
     own = take_rows(rows, index)._replace(share=chosen.share)
     # What is not finite would make derivatives NaN, although no such pose is chosen.
     solution, other = (anchor, found, directions, inflation), _any_solution(prior is not None)
