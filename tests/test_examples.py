@@ -11,7 +11,8 @@ def test_extrinsics_are_found_from_ten_frames(capsys):
     calibrate_extrinsics.main()
     lines = capsys.readouterr().out.splitlines()
     first, last = (
-        [float(number) for number in re.findall(r"\d+\.\d+", line)] for line in (lines[0], lines[-1])
+        [float(number) for number in re.findall(r"\d+\.\d+", line)]
+        for line in (lines[0], lines[-1])
     )
     assert first[0] > 2.9
     assert first[1] > 1.9

@@ -370,6 +370,15 @@ def test_inside_jit_a_pose_that_is_not_rigid_stays_and_has_no_derivatives(room, 
     np.testing.assert_array_equal(slope, 0)
 
 
+def test_a_pose_half_a_turn_from_its_prior_has_not_converged(room):
+    cloud, pose = room_cloud(8, COUNT)
+    prior = (0.1**2 * np.eye(6)).astype(np.float32)
+    for turn_rad, converged in ((0.0, True), (np.pi, False)):
+        mean = moved(pose, np.zeros(3), [0, 0, turn_rad])
+        found = refine_with_prior(room, cloud, pose, mean, prior)
+        assert bool(found.converged) == converged
+
+
 def test_the_reach_has_a_gradient(room):
     """It is zero, but a loop that ends early has none in reverse mode."""
 

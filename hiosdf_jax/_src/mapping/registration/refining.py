@@ -59,6 +59,9 @@ _CANDIDATES = 16384
 
 _LEAST_REACH_M = 1e-3
 
+# Half a turn from the mean of a prior, the direction back to it is not defined.
+_MOST_TURN_RAD = 3.0
+
 
 class Registration(NamedTuple):
     """A pose that was refined by a map.
@@ -184,12 +187,13 @@ def _refine(
     covariance = covariance_of(residuals, directions, held, rows)
 
     verdict = judge(still, frozen, found)
-    # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
-    near_start = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
-    near_start |= prior is not None
     usable = is_rigid(found) & jnp.all(jnp.isfinite(covariance))
-    if prior is not None:
+    if prior is None:
+        # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
+        near = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
+    else:
         usable &= is_rigid(prior[0])
+        near = way_and_angle(prior[0], found)[1] <= _MOST_TURN_RAD
     own = take_rows(rows, index)._replace(share=chosen.share)
     # What is not finite would make derivatives NaN, although no such pose is chosen.
     solution, other = (anchor, found, directions, inflation), _any_solution(prior is not None)
@@ -199,7 +203,7 @@ def _refine(
         covariance=covariance,
         residual=verdict.residual,
         inliers=verdict.inliers,
-        converged=rests & verdict.fits & usable & near_start,
+        converged=rests & verdict.fits & usable & near,
     )
 
 
