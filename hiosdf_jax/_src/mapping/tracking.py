@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,10 +62,11 @@ def track(
             m or rad, is refused.
 
     Returns:
-        The new map, and the registration. `converged` is False if the cloud fits nowhere, or if a
-        young map refused it, such as one at a pose that is not finite. Then the pose is the
-        predicted one, and the covariance that of the prior, or 100 m. The covariance of the first
-        cloud is that of the prior, or 0: its pose defines where the map is.
+        The new map, and the registration. `converged` is False if the cloud fits nowhere, or if
+        `update` refuses it during the first five updates, for instance because the predicted pose
+        is not finite. Then the pose is the predicted one, and the covariance that of the prior, or
+        100 m. The covariance of the first cloud is that of the prior, or 0: its pose defines where
+        the map is.
 
     Raises:
         ValueError: As `refine_pose` and `update` do.
@@ -93,12 +94,11 @@ def track(
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
     found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     own = _covariance_of(prior)
-    found, registered, flags_so_far = _register_jit(state.updates, start, found, own, reach)
-    updates_if_fused = state.updates + 1  # before `state` is donated
+    found, decision = _register_jit(state.updates, start, found, own, reach)
     extras, donate = (None, checked_noise), donate and not traced
-    state = run_update(state, fused_cloud, found.pose, extras, flags_so_far, donate)
+    state = run_update(state, fused_cloud, found.pose, extras, decision.flags, donate)
     # `update` may refuse what a young map takes on trust.
-    converged = _confirm_jit(found.converged, registered, state.updates, updates_if_fused)
+    converged = _confirm_jit(found.converged, decision, state.updates)
     return state, found._replace(converged=converged)
 
 
@@ -163,6 +163,20 @@ def _covariance_of(prior: tuple[Any, Any] | None) -> jax.Array | None:
     return None if prior is None else on_device("prior covariance", prior[1])
 
 
+class _Decision(NamedTuple):
+    """What is decided before the update.
+
+    Attributes:
+        registered: The map determined the pose, () bool.
+        updates_if_fused: Number of updates after the cloud is fused, () int32.
+        flags: Flags of `Flag` that this raises, () uint32.
+    """
+
+    registered: jax.Array
+    updates_if_fused: jax.Array
+    flags: jax.Array
+
+
 @plain
 def _register(
     updates: jax.Array,
@@ -170,12 +184,8 @@ def _register(
     found: Registration,
     own: jax.Array | None,
     reach_m: jax.Array,
-) -> tuple[Registration, jax.Array, jax.Array]:
-    """Decides whether a cloud is fused, and where.
-
-    Returns:
-        The registration, whether the map determined it, and the flags that this raises.
-    """
+) -> tuple[Registration, _Decision]:
+    """Decides whether a cloud is fused, and where."""
     first = updates == 0
     near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
     registered = found.converged & near & ~first
@@ -188,14 +198,13 @@ def _register(
         covariance=jnp.where(registered, found.covariance, own),
         converged=fused,
     )
-    return chosen, registered, jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
+    flags = jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
+    return chosen, _Decision(registered, updates + 1, flags)
 
 
 _register_jit = jax.jit(_register)
 
 
 @jax.jit
-def _confirm_jit(
-    fused: jax.Array, registered: jax.Array, updates: jax.Array, updates_if_fused: jax.Array
-) -> jax.Array:
-    return registered | (fused & (updates == updates_if_fused))
+def _confirm_jit(fused: jax.Array, decision: _Decision, updates: jax.Array) -> jax.Array:
+    return decision.registered | (fused & (updates == decision.updates_if_fused))

@@ -235,17 +235,15 @@ def between(limits: tuple[float, float], share: jax.Array | float) -> jax.Array 
 
 
 def noise_of(field: Field | Baked) -> tuple[float, float]:
-    """Returns (a, b) of the standard deviation a + b r^2 of a return, m and 1/m.
-
-    It is that of the map's configuration. A baked field has none, and gets the default.
-    """
-    if isinstance(field, Field):
-        return field.config.range_noise
-    return Config.range_noise
+    """Returns (a, b) of the standard deviation a + b r^2 of a return, m and 1/m."""
+    return _config_of(field).range_noise
 
 
 def least_range_of(field: Field | Baked) -> float:
-    """Returns the least range of a return, m: as for the noise, that of a configuration."""
-    if isinstance(field, Field):
-        return field.config.min_range
-    return Config.min_range
+    """Returns the least range of a return, m."""
+    return _config_of(field).min_range
+
+
+def _config_of(field: Field | Baked) -> Config | type[Config]:
+    """Returns the map's configuration. A baked field has none, and gets the defaults."""
+    return field.config if isinstance(field, Field) else Config
