@@ -321,7 +321,6 @@ def test_the_distance_transform_s_work_is_what_xla_is_given(monkeypatch):
     # Without a loop, whose work XLA counts once.
     monkeypatch.setattr(loops, "_ROUNDS_PER_STEP", 12)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(nearest, "_SMALL", 0)  # the limit is that of large maps
     window = Window((5, 0, 0), (30, 30, 20), (8, 2, 0), (20, 24, 20))
     part = nearest.Part(window.within, window.inner_shape)
     sites, offset = jnp.zeros((2, *window.shape), bool), jnp.zeros((*window.shape, 3))

@@ -157,10 +157,11 @@ def _network_work(config: Config, products: int) -> Work:
 def distance_work(config: Config, window: Window) -> Work:
     """Counts the work of the distance transform: comparisons, and memory read and written once.
 
-    The transform of an axis compares each voxel with those within the horizon along it, with six
-    operations each: two sums, a square, a comparison, a choice, a minimum. It cuts the box down
-    along its axis. There are two searches. The evidence (hits, passes, behind, mean and axes) has
-    30 bytes per voxel; the distances (nearest, sdf and doubt) have 7 per voxel that can change.
+    The transform of an axis compares each voxel with those within the horizon along it, with seven
+    operations each: two sums, a product, a conversion to bits, two operations on them, and a
+    minimum. It cuts the box down along its axis. There are two searches. The evidence (hits,
+    passes, behind, mean and axes) has 30 bytes per voxel; the distances (nearest, sdf and doubt)
+    have 7 per voxel that can change.
     """
     shape, compared = list(window.shape), 0
     for axis in axis_order(config):
@@ -168,4 +169,4 @@ def distance_work(config: Config, window: Window) -> Work:
         shape[axis] = window.inner_shape[axis]
         compared += 2 * reach * math.prod(shape)
     memory = 30.0 * math.prod(window.shape) + 7.0 * math.prod(window.inner_shape)
-    return Work(vector=2 * 6.0 * compared, memory=memory)
+    return Work(vector=2 * 7.0 * compared, memory=memory)
