@@ -14,7 +14,7 @@ from hiosdf_jax._src.grid.evidence import EvidenceWindow, is_observed
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
-from hiosdf_jax._src.numerics.vectors import length, split
+from hiosdf_jax._src.numerics.vectors import each, length, split
 
 # A new thing hides free space up to this far behind its visible side, m: nothing is known of its
 # depth, and what stood there before may still stand.
@@ -109,7 +109,7 @@ def hide_behind(
         seen_past = jnp.where(jnp.isfinite(filled.nearest), filled.nearest, -jnp.inf)
 
         center_world = geometry.window_centers(config, window.start, window.hits.shape)
-        offset = split(center_world - rays.sensor_world)
+        offset = each(jnp.subtract, center_world, split(rays.sensor_world))
         distance, pixel = length(offset), directions.pixel_of(offset)
         behind = (new[pixel] < distance - 0.5 * size) & (new[pixel] > distance - _HIDES_M)
         sure = unsure[pixel] < distance - 0.5 * size

@@ -33,7 +33,7 @@ def clear_robot(
     voxel_world = geometry.window_centers(config, window.start, window.hits.shape)
     center = each(
         lambda v, m: (v + m.astype(jnp.float32) * config.voxel_size).ravel(),
-        split(voxel_world),
+        voxel_world,
         split(window.mean),
     )
 

@@ -17,7 +17,7 @@ from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
 from hiosdf_jax._src.numerics.modes import varying_like
-from hiosdf_jax._src.numerics.vectors import split
+from hiosdf_jax._src.numerics.vectors import each, split
 
 # Passes stop this far (voxels) before the end of the ray. Measured on a depth stream: 0.78 cm with
 # 1.5, 0.62 cm with 1, at the same recall; on a LiDAR stream 0.73 cm with both.
@@ -53,10 +53,17 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
 
     def count(array: jax.Array, steps: jax.Array, counted: jax.Array) -> jax.Array:
         """Adds 1 for each (N, K) step, in voxels along the ray, that is counted."""
-        along = (steps * size)[..., None] * rays.directions_world[:, None, :]
-        points = rays.sensor_world + along
-        index, _, inside = geometry.voxel_of_window(config, window.start, shape, points)
-        voxel = jnp.where(counted & inside, geometry.flat_index(shape, split(index)), voxels)
+        along = steps * size
+        point_world = each(
+            lambda sensor, direction: sensor + along * direction[:, None],
+            split(rays.sensor_world),
+            split(rays.directions_world),
+        )
+        index, inside = geometry.voxel_around(config, point_world)
+        index = each(jnp.subtract, index, window.start)
+        for i, most in zip(index, shape, strict=True):
+            inside &= (i >= 0) & (i < most)
+        voxel = jnp.where(counted & inside, geometry.flat_index(shape, index), voxels)
         return array.at[voxel.ravel()].add(1, mode="drop")
 
     free = jnp.where(rays.in_range, ranges / size - jnp.where(ends, _MARGIN_VOXELS, 0), -1)

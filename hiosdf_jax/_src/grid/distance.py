@@ -10,6 +10,7 @@ from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.nearest import Part, nearest_sites
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
+from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
 from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid, Side
 
@@ -90,7 +91,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
             grid.evidence.axes,
         )
     )
-    hits, passes, behind, mean = (x.astype(jnp.float32) for x in (hits, passes, behind, mean))
+    hits, passes, behind = (x.astype(jnp.float32) for x in (hits, passes, behind))
     order = axis_order(config)
     features = patches.is_feature(config, hits, passes, axes)
     doubtful = patches.is_doubtful(hits, passes)
@@ -113,7 +114,8 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     offset = patches.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
     sure = hits.ravel()[row] >= _SURE_HITS
     marked = squared.ravel() < _HIDDEN_REACH_VOXELS**2
-    sign, side = _side(passes, behind, here, offset, middle, short, sure, marked)
+    # Otherwise a CPU computes the sides once for each of the results, on one core.
+    sign, side = compute_once(_side(passes, behind, here, offset, middle, short, sure, marked))
     signed_m = sign * length(offset) * config.voxel_size
     sdf = jnp.where(found, signed_m, config.distance_horizon)
     jump = jnp.where(found[..., None], join(jump), NO_FEATURE)

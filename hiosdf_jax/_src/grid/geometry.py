@@ -107,10 +107,24 @@ def center_along(config: Config, index: jax.Array, corner: Any) -> jax.Array:
     return ((index + corner).astype(jnp.float32) + 0.5) * config.voxel_size
 
 
-def window_centers(config: Config, start: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Returns the centers of all voxels of a window, (X, Y, Z, 3) m, world frame."""
-    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij"), axis=-1)
-    return voxel_center(config, start + index)
+def window_centers(config: Config, start: jax.Array, shape: tuple[int, ...]) -> Vector:
+    """Returns the centers of all voxels of a window, m, world frame.
+
+    Args:
+        config: The map's configuration.
+        start: First voxel of the window, (3,) int32.
+        shape: Shape of the window.
+
+    Returns:
+        (X, 1, 1), (1, Y, 1) and (1, 1, Z): each coordinate depends on one index.
+    """
+
+    def along(axis: int) -> jax.Array:
+        kept = [count if k == axis else 1 for k, count in enumerate(shape)]
+        index = start[axis] + jax.lax.broadcasted_iota(jnp.int32, kept, axis)
+        return center_along(config, index, config.corner_index[axis])
+
+    return each(along, range(3))
 
 
 def flat_index(shape: tuple[int, ...], index: Vector) -> jax.Array:

@@ -15,6 +15,7 @@ from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.numerics.intake import as_floats, is_traced
 from hiosdf_jax._src.numerics.modes import plain
+from hiosdf_jax._src.numerics.vectors import each
 from hiosdf_jax._src.state import Evidence, Grid, MapState, check_map
 
 
@@ -54,7 +55,8 @@ def forget(state: MapState, box: Any) -> MapState:
 @plain
 def _forget(config: Config, grid: Grid, corners: jax.Array) -> Grid:
     center_world = geometry.window_centers(config, jnp.zeros(3, jnp.int32), config.grid_shape)
-    inside = jnp.all((center_world >= corners[0]) & (center_world <= corners[1]), axis=-1)
+    x, y, z = each(lambda c, low, high: (c >= low) & (c <= high), center_world, *corners)
+    inside = x & y & z
 
     def clear(known: jax.Array, empty: jax.Array) -> jax.Array:
         return jnp.where(inside.reshape(*inside.shape, *[1] * (known.ndim - 3)), empty, known)
