@@ -353,7 +353,7 @@ def test_update_with_64_bit_numbers_enabled():
         "from room import CONFIG, stream\n"
         # Both windows around a cloud, and several tiles of the network's rows.
         "config = dataclasses.replace(CONFIG, bounds=((-9, -1, -1), (9, 1, 1)), batches=1,\n"
-        "    max_range=2.0, near_samples=2000, distance_horizon=0.3, frontier_horizon=0.3)\n"
+        "    max_range=2.0, near_samples=5000, distance_horizon=0.3, frontier_horizon=0.3)\n"
         "count = config.near_samples + config.far_samples\n"
         "assert count > tiles.LARGEST\n"
         "shapes = [geometry.window_shape(config, share * 2.0 + 1.2) for share in (0.5, 1)]\n"
