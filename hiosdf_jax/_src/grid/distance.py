@@ -101,36 +101,52 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
 
     # From the centers of the part's voxels to their nearest patches.
-    nearest = nearest.ravel()
-    found, row = nearest >= 0, jnp.maximum(nearest, 0)
-    here = each(jnp.add, geometry.unflatten(inner, jnp.arange(row.size, dtype=jnp.int32)), within)
+    found, row = nearest >= 0, compute_once(jnp.maximum(nearest, 0))
+    here = each(lambda k: within[k] + jax.lax.broadcasted_iota(jnp.int32, inner, k), range(3))
     jump = each(jnp.subtract, geometry.unflatten(shape, row), here)
     means, spans = mean.reshape(-1, 3), axes.reshape(-1, 9)
-    # Otherwise XLA gathers them again for each of the results.
-    row, here, jump, center, long, middle, short = jax.lax.optimization_barrier(
-        (row, here, jump, take(means, row), *(take(spans, row, first) for first in (0, 3, 6)))
-    )
-    patch = each(jnp.add, center, jump)
+    long, middle, short = (take(spans, row, first) for first in (0, 3, 6))
+    patch = each(jnp.add, take(means, row), jump)
     offset = patches.patch_offset(each(jnp.zeros_like, patch), patch, (long, middle))
     sure = hits.ravel()[row] >= _SURE_HITS
-    marked = squared.ravel() < _HIDDEN_REACH_VOXELS**2
-    # Otherwise a CPU computes the sides once for each of the results, on one core.
-    sign, side = compute_once(_side(passes, behind, here, offset, middle, short, sure, marked))
+    marked = squared < _HIDDEN_REACH_VOXELS**2
+    sign, side = _side(passes, behind, here, offset, middle, short, sure, marked)
     signed_m = sign * length(offset) * config.voxel_size
     sdf = jnp.where(found, signed_m, config.distance_horizon)
+    side = jnp.where(found, side, Side.UNKNOWN)
+    known = grid.derived
+    sdf, side = _compute_together(sdf.astype(known.sdf.dtype), side.astype(known.side.dtype))
     jump = jnp.where(found[..., None], join(jump), NO_FEATURE)
 
     def write(old: jax.Array, values: jax.Array) -> jax.Array:
-        values = values.reshape(*inner, *old.shape[3:]).astype(old.dtype)
-        return geometry.write_window(old, inner_start, values)
+        return geometry.write_window(old, inner_start, values.astype(old.dtype))
 
-    known = grid.derived
     return known.replace(
         nearest=write(known.nearest, jump),
         sdf=write(known.sdf, sdf),
-        side=write(known.side, jnp.where(found, side, Side.UNKNOWN)),
+        side=write(known.side, side),
         doubt=write(known.doubt, doubt),
     )
+
+
+def _compute_together(sdf: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Has two results computed by one kernel, as one number.
+
+    XLA on a CPU makes one kernel per result, and would gather the patches for each of them, or
+    store all that both need.
+
+    Args:
+        sdf: (...) float16.
+        side: (...) int8.
+
+    Returns:
+        The same values.
+    """
+    bits = jax.lax.bitcast_convert_type(sdf, jnp.uint16).astype(jnp.uint32)
+    both = bits | (jax.lax.bitcast_convert_type(side, jnp.uint8).astype(jnp.uint32) << 16)
+    both = jax.lax.optimization_barrier(both)
+    sdf = jax.lax.bitcast_convert_type(both.astype(jnp.uint16), sdf.dtype)
+    return sdf, jax.lax.bitcast_convert_type((both >> 16).astype(jnp.uint8), side.dtype)
 
 
 def is_free(
@@ -169,16 +185,16 @@ def _side(
     Args:
         passes: Rays that went through the window's voxels, (X, Y, Z).
         behind: Rays that ended a little before the window's voxels, (X, Y, Z).
-        here: Indices of the voxels in the window, (N,) each.
-        offset: From the nearest point of the nearest patch to the center, (N,) each, voxels.
-        middle: The second principal axis of that patch, (N,) each.
-        short: Its third axis, along the normal, (N,) each.
-        sure: That patch has enough hits for a plane, (N,) bool.
-        marked: The center is so near to some hits that `behind` may be due to them, (N,) bool.
+        here: Indices of the voxels in the window, (...) each.
+        offset: From the nearest point of the nearest patch to the center, (...) each, voxels.
+        middle: The second principal axis of that patch, (...) each.
+        short: Its third axis, along the normal, (...) each.
+        sure: That patch has enough hits for a plane, (...) bool.
+        marked: The center is so near to some hits that `behind` may be due to them, (...) bool.
 
     Returns:
-        sign: (N,) float32; 0 where nothing decides.
-        side: What decides, (N,) int8, see `Side`.
+        sign: (...) float32; 0 where nothing decides.
+        side: What decides, (...) int8, see `Side`.
     """
     shape = passes.shape
     passes, behind = passes.ravel(), behind.ravel()
