@@ -237,10 +237,12 @@ def _look(
     u = dot(point, wide(unit_long)) / half_long[..., None]
     v = dot(point, wide(across)) / half_across[..., None]
     crosses = beyond & (jnp.abs(u) < 1) & (jnp.abs(v) < 1)
-    quarters = jnp.zeros(row.shape, jnp.int32)
-    for left in (False, True):
-        for low in (False, True):
-            here = crosses & ((u < 0) == left) & ((v < 0) == low)
-            quarters += jnp.any(here, axis=-1)
-    several = (quarters == 2) & (jnp.sum(crosses, axis=-1) >= _SEVERAL_RAYS)
+    # One sum counts the rays through all quarters, in a byte each.
+    quarter = 2 * (u < 0).astype(jnp.int32) + (v < 0)
+    counts = jnp.where(crosses, jnp.left_shift(jnp.int32(1), 8 * quarter), 0)
+    counts = jnp.sum(counts, axis=-1, dtype=jnp.int32)
+    counts = [(counts >> (8 * k)) & 255 for k in range(4)]
+    none = jnp.zeros(row.shape, jnp.int32)
+    quarters = sum(((count > 0).astype(jnp.int32) for count in counts), none)
+    several = (quarters == 2) & (sum(counts, none) >= _SEVERAL_RAYS)
     return jnp.where(several, 2, jnp.maximum(quarters - 1, 0)), quarters > 0, past
