@@ -1,6 +1,7 @@
 """The sign of voxels, and distances that are computed where they can change."""
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from hiosdf_jax._src.grid import distance
@@ -59,3 +60,12 @@ def test_a_sheet_has_free_space_on_both_sides():
         )
         assert float(sign[0]) == expected
         assert int(side[0]) == (Side.SHEET if free else Side.PLANE)
+
+
+def test_distances_and_sides_that_are_computed_together_keep_all_bits():
+    bits = np.arange(2**16, dtype=np.uint16)
+    bits = np.append(bits, bits)
+    side = np.arange(bits.size).astype(np.int8)[::-1]
+    sdf, found = distance._compute_together(jnp.asarray(bits.view(np.float16)), jnp.asarray(side))
+    np.testing.assert_array_equal(np.asarray(sdf).view(np.uint16), bits)
+    np.testing.assert_array_equal(found, side)
