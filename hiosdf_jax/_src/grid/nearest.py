@@ -188,6 +188,13 @@ def _find_nearest(
 ) -> jax.Array:
     """Finds the least squared distances along the middle axis of arrays (A, N, B).
 
+    Args:
+        squared: Squared distance to each voxel's candidate, (A, N, B) voxels^2.
+        along: Offset of the candidate along the middle axis, (A, N, B) voxels.
+        reach: Largest shift, voxels.
+        first: First voxel along that axis.
+        length: Voxels along that axis, static.
+
     Returns:
         (A, length, B) int32, see `_with_shift`.
     """
