@@ -48,8 +48,9 @@ def add_new_surfaces(
         surfaces, (N,) bool.
     """
     shape = window.hits.shape
-    index, _, inside = geometry.voxel_of_window(config, window.start, shape, rays.points_world)
-    voxel = geometry.flat_index(shape, split(index))
+    point_world = split(rays.points_world)
+    index, inside = geometry.window_voxel_around(config, window.start, shape, point_world)
+    voxel = geometry.flat_index(shape, index)
     target = jnp.where(novelty.novel & inside, voxel, window.hits.size)
     # Next to a new surface a single one will do: it belongs to the same thing.
     count = jnp.where(novelty.near_new, _LEAST_NOVEL_HITS, 1)

@@ -59,10 +59,7 @@ def trace_rays(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWi
             split(rays.sensor_world),
             split(rays.directions_world),
         )
-        index, inside = geometry.voxel_around(config, point_world)
-        index = each(jnp.subtract, index, window.start)
-        for i, most in zip(index, shape, strict=True):
-            inside &= (i >= 0) & (i < most)
+        index, inside = geometry.window_voxel_around(config, window.start, shape, point_world)
         voxel = jnp.where(counted & inside, geometry.flat_index(shape, index), voxels)
         return array.at[voxel.ravel()].add(1, mode="drop")
 

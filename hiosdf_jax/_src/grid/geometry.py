@@ -89,6 +89,27 @@ def voxel_of_window(
     return index, offset, inside & within
 
 
+def window_voxel_around(
+    config: Config, start: jax.Array, shape: tuple[int, ...], point: Vector
+) -> tuple[Vector, jax.Array]:
+    """Finds the voxels of a window that contain points, as `voxel_of_window` does.
+
+    Args:
+        config: The map's configuration.
+        start: First voxel of the window, (3,) int32.
+        shape: Shape of the window.
+        point: (...) m each.
+
+    Returns:
+        Voxel indices relative to the window, (...) int32 each, undefined for points outside of it;
+        and whether the point is inside, (...) bool, False for a point with a NaN.
+    """
+    index, inside = voxel_around(config, point)
+    index = each(jnp.subtract, index, start)
+    x, y, z = each(lambda i, count: (i >= 0) & (i < count), index, shape)
+    return index, inside & x & y & z
+
+
 def voxel_center(config: Config, index: jax.Array) -> jax.Array:
     """Computes the centers of voxels.
 
