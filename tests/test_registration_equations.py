@@ -63,6 +63,18 @@ def test_a_return_as_far_as_the_scale_keeps_the_same_weight(sharp_map):
     np.testing.assert_allclose(ratio[0], ratio[1], rtol=0.01)
 
 
+@pytest.mark.parametrize("growing", [0.0, 1.0])
+@pytest.mark.parametrize("scale_m", [0.1, comparing.GROWING_REACH_M])
+def test_a_tolerance_can_be_added_later(sharp_map, growing, scale_m):
+    field, (cloud, pose) = field_of(sharp_map), returns()
+    rows = make_rows(jnp.asarray(cloud), jnp.ones(COUNT, bool), (0.01, 0.0), growing)
+    later = comparing.tolerate(compared(field, cloud, pose, growing), rows, scale_m)
+    expected = compared(field, cloud, pose, growing, scale_m=scale_m)
+    assert float(jnp.mean(later.comparable)) > 0.3
+    for name, one, other in zip(later._fields, later, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
 def on_wall():
     """Returns on the wall at x = HALF[0], not near its edges, world frame."""
     rng = np.random.default_rng(0)

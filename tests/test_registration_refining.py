@@ -401,7 +401,8 @@ def test_a_line_or_a_point_of_returns_moves_only_onto_its_wall(corridor, along, 
     way = np.linalg.norm(error(found.pose, start)[:3])
     assert way < 0.06 or not bool(found.converged)
     rows = comparing.make_rows(jnp.asarray(cloud), jnp.ones(COUNT, bool), NOISE)
-    assert int(equations.find_directions(corridor, rows, np.eye(4)).free.sum()) == free
+    here = comparing.compare(corridor, rows, np.eye(4), 0.0)
+    assert int(equations.find_directions(corridor, rows, np.eye(4), here).free.sum()) == free
 
 
 def test_the_covariance_of_an_oblique_corridor_is_a_prior(corridor):

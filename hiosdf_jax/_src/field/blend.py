@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Bounds, Config
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.network import siren
+from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.state import Field, Unknown
 
 # The grid's answer fades out between these shares of its horizon.
@@ -63,7 +64,9 @@ def sdf(field: Field, points_world: jax.Array, unknown: Unknown) -> jax.Array:
     if config.grid_share == 0:
         return network
     grid = lookup.grid_sdf(config, field.surface, points_world)
-    return _combine(config, grid, network, frontier(field, points_world), unknown)
+    unseen = frontier(field, points_world)
+    grid, network, unseen = map(compute_once, (grid, network, unseen))
+    return _combine(config, grid, network, unseen, unknown)
 
 
 def frontier(field: Field, points_world: jax.Array) -> jax.Array:
@@ -136,6 +139,7 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
     doubt = lookup.doubt_distance(config, field.surface, points_world)
     unseen = frontier(field, points_world)
+    nearest, network, doubt, unseen = map(compute_once, (nearest, network, doubt, unseen))
     cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen, "network"), doubt)
     return _expect_hidden(cautious, unseen, _HIDDEN_VOXELS * config.voxel_size), scale
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.numerics.barriers import differentiate_once
+from hiosdf_jax._src.numerics.barriers import differentiate_once, in_kernel
 from hiosdf_jax._src.numerics.vectors import Vector, each
 
 type Start = tuple[jax.Array | np.int32, ...]
@@ -194,7 +194,10 @@ def corners_of(config: Config, point: Vector) -> Corners:
         The corners.
     """
     point = differentiate_once(each(lambda p: p / config.voxel_size - 0.5, point))
-    number = jax.lax.broadcasted_iota(jnp.int32, (8, *[1] * point[0].ndim), 0)
+    shape = 8, *[1] * point[0].ndim
+    number: Any = np.arange(8, dtype=np.int32).reshape(shape)
+    if in_kernel():  # takes no arrays of constants
+        number = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
 
     upper = each(lambda bit: (number >> bit) & 1, (2, 1, 0))
     base = each(jnp.floor, point)
@@ -204,8 +207,9 @@ def corners_of(config: Config, point: Vector) -> Corners:
     x, y, z = each(jnp.equal, index, nearest)
 
     def share(p: jax.Array, base: jax.Array, upper: jax.Array) -> jax.Array:
-        fraction = p - base
-        return jnp.where(upper == 1, fraction, 1 - fraction)
+        # Without a selection, which would double the sums of the derivative.
+        fraction, upper = p - base, upper.astype(np.float32)
+        return (1 - upper) + (2 * upper - 1) * fraction
 
     shares = each(share, point, base, upper)
     flat = flat_index(config.grid_shape, nearest)

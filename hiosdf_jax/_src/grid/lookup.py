@@ -268,11 +268,14 @@ def _patches_at(
         return (point_m - geometry.center_along(config, first, corner)) / config.voxel_size
 
     point = differentiate_once(each(relative, point_world, first, config.corner_index))
+    # Broadcast here, derivatives by the eight are added before they are summed.
+    point = each(lambda p: jnp.broadcast_to(p, found.shape), compute_once(point))
     sites = each(lambda i, j: jnp.where(found, i + j, 0), corners.index, jump)
     row = geometry.flat_index(config.grid_shape, sites)
     found, sites, row = compute_once((found, sites, row))
     means, axes = surface.mean.reshape(-1, 3), surface.axes.reshape(-1, 9)
     mean = each(lambda m, s, f: m + (s - f), take(means, row), sites, first)
+    mean = compute_once(mean)
     fixed = jax.lax.stop_gradient(point)
     offset = patches.patch_offset(fixed, mean, (take(axes, row), take(axes, row, 3)))
     away = jnp.where(found, length(offset), 0)

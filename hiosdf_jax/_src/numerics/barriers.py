@@ -24,6 +24,11 @@ def no_barriers() -> Iterator[None]:
         _barred.reset(token)
 
 
+def in_kernel() -> bool:
+    """Returns whether what is traced becomes a kernel of ours, see `no_barriers`."""
+    return not _barred.get()
+
+
 def compute_once(tree: Any) -> Any:
     """Has arrays computed once, however many others are computed from them.
 
@@ -31,7 +36,7 @@ def compute_once(tree: Any) -> Any:
     kernel that reads the array, gathers included. A GPU gains from the fewer kernels.
 
     Args:
-        tree: A pytree of arrays.
+        tree: A pytree of arrays. In reverse mode either all or none of them may have tangents.
 
     Returns:
         The same values. Differentiable.

@@ -135,10 +135,15 @@ def take_rows(rows: Rows, index: jax.Array | slice) -> Rows:
     return rows._replace(points=rows.points[index], sigma=rows.sigma[index], some=rows.some[index])
 
 
-def take_evenly(rows: Rows, count: int = _EVEN_ROWS) -> Rows:
+def even_index(rows: Rows, count: int = _EVEN_ROWS) -> jax.Array:
     """Selects returns at even steps, or all if there are fewer; the rows begin with the returns."""
     count = min(count, rows.points.shape[0])
-    return take_rows(rows, even_steps(jnp.sum(rows.some), count).astype(jnp.int32))
+    return even_steps(jnp.sum(rows.some), count).astype(jnp.int32)
+
+
+def take_evenly(rows: Rows, count: int = _EVEN_ROWS) -> Rows:
+    """Returns the rows of `even_index`."""
+    return take_rows(rows, even_index(rows, count))
 
 
 def units(rows: Rows) -> jax.Array:
@@ -233,11 +238,7 @@ def _residuals_at(
     variance += found.spread**2 + _LEAST_SIGMA_M**2
     deepest = jnp.maximum(_DEEPEST_M, _DEEPEST_SCALES * (scale_m - GROWING_REACH_M))
     comparable = some[0] & found.usable & (found.depth < deepest)
-    deviations = between(_OUTLIER_DEVIATIONS, growing)
-    whole = jnp.sqrt(variance + (scale_m / deviations) ** 2)
-    # The function of Geman and McClure.
-    ratio = found.distance / (deviations * whole)
-    weight = jnp.where(comparable, 1 / (whole * (1 + ratio**2)) ** 2, 0)
+    whole, weight = _tolerant(found.distance, variance, comparable, growing, scale_m)
     lever = each(lambda part: part / length, cross(offset, found.normal))
     jacobian: Any = (*found.normal, *lever)
     points_world: Any = point_world
@@ -251,6 +252,34 @@ def _residuals_at(
         points_world=points_world,
         width=jnp.where(some[0], found.width, 0),
     )
+
+
+def _tolerant(
+    distance: jax.Array, variance: jax.Array, comparable: jax.Array, growing: Any, scale_m: Any
+) -> tuple[jax.Array, jax.Array]:
+    """Computes `Residuals.sigma` and `Residuals.weight` where surfaces may be `scale_m` off."""
+    deviations = between(_OUTLIER_DEVIATIONS, growing)
+    whole = jnp.sqrt(variance + (scale_m / deviations) ** 2)
+    # The function of Geman and McClure.
+    ratio = distance / (deviations * whole)
+    return whole, jnp.where(comparable, 1 / (whole * (1 + ratio**2)) ** 2, 0)
+
+
+def tolerate(residuals: Residuals, rows: Rows, scale_m: float) -> Residuals:
+    """Returns residuals as `compare` gives them with a tolerance, from those without one.
+
+    Args:
+        residuals: The rows at a pose, compared with a scale of 0.
+        rows: The rows.
+        scale_m: As for `compare`, at most `GROWING_REACH_M`.
+
+    Returns:
+        The residuals.
+    """
+    sigma, weight = _tolerant(
+        residuals.distance, residuals.sigma**2, residuals.comparable, rows.growing, scale_m
+    )
+    return residuals._replace(sigma=sigma, weight=weight)
 
 
 class Sums(NamedTuple):

@@ -15,6 +15,7 @@ import numpy as np
 
 from hiosdf_jax._src.mapping.registration.comparing import (
     LOWER,
+    Residuals,
     Rows,
     Sums,
     compare,
@@ -106,18 +107,20 @@ def sum_in_cells(
     return jax.ops.segment_sum(values, (row % cells).astype(jnp.int32), cells)
 
 
-def find_directions(field: Field | Baked, rows: Rows, pose: jax.Array) -> Directions:
+def find_directions(
+    field: Field | Baked, rows: Rows, pose: jax.Array, here: Residuals
+) -> Directions:
     """Finds the principal directions of the returns' information, and which are free.
 
     Args:
         field: The map.
         rows: The returns.
         pose: (4, 4), near the solution.
+        here: The returns at this pose, compared with a scale of 0.
 
     Returns:
         The directions, the least determined first.
     """
-    here = compare(field, rows, pose, 0.0)
     # Means over cells of space: they average the noise of normals.
     counts = (here.weight * here.sigma**2)[:, None]
     values = jnp.concatenate([counts, counts * here.jacobian], axis=-1)

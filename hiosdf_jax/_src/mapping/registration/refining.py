@@ -14,7 +14,6 @@ from hiosdf_jax._src.field.queries import AnyField, as_field
 from hiosdf_jax._src.mapping.registration.comparing import (
     GROWING_REACH_M,
     make_rows,
-    measure_share,
     take_rows,
     units,
 )
@@ -180,9 +179,7 @@ def _refine(
     begin, reach_m = jax.lax.stop_gradient((pose, reach_m))
     near, share = solve_coarse(still, frozen, begin, held, reach_m, starts)
     rows, frozen = rows._replace(share=share), frozen._replace(share=share)
-    index, directions = select_rows(still, frozen, near)
-    # These returns lie on narrower patches than others.
-    chosen = measure_share(still, take_rows(frozen, index), near)
+    index, chosen, directions = select_rows(still, frozen, near)
     found, residuals, rests, inflation = solve_fine(still, chosen, near, directions, held)
     covariance = covariance_of(residuals, directions, held, rows)
 

@@ -16,11 +16,14 @@ from hiosdf_jax._src.mapping.registration.comparing import (
     Rows,
     Sums,
     compare,
+    even_index,
     information_of,
     no_sums,
     slope_of,
     sum_returns,
     take_evenly,
+    take_rows,
+    tolerate,
     units,
 )
 from hiosdf_jax._src.mapping.registration.equations import (
@@ -33,9 +36,11 @@ from hiosdf_jax._src.mapping.registration.equations import (
     fit_of,
     fits_better,
 )
+from hiosdf_jax._src.mapping.registration.matching import share_of_map
 from hiosdf_jax._src.mapping.registration.motion import motion_between, move, way_and_angle
 from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.mapping.registration.uncertainty import inflation_of
+from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.small_matrices import product
@@ -194,7 +199,21 @@ def solve_coarse(
     return jax.lax.while_loop(continues, begin, first)[0]
 
 
-def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.Array, Directions]:
+class Selection(NamedTuple):
+    """The returns for the fine steps.
+
+    Attributes:
+        index: Their numbers among all rows, (K,) int32.
+        rows: The rows; they lie on narrower patches than others, so their share is measured anew.
+        directions: Principal directions of all returns.
+    """
+
+    index: jax.Array
+    rows: Rows
+    directions: Directions
+
+
+def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> Selection:
     """Selects the returns that determine the pose best, for the fine steps.
 
     Args:
@@ -203,14 +222,24 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
         pose: (4, 4), near the solution.
 
     Returns:
-        Indices of rows, at most as many as fine steps use, all returns if there are no more; and
-        the principal directions of the returns.
+        At most as many returns as fine steps use, all if there are no more.
     """
-    directions = find_directions(field, take_evenly(rows), pose)
-    if rows.points.shape[0] <= _FINE_ROWS:
-        return jnp.arange(rows.points.shape[0]), directions
-    whole = jnp.arange(_FINE_ROWS, dtype=jnp.int32)
-    residuals = compare(field, rows, pose, _SELECTED_M)
+    here = compute_once(compare(field, rows, pose, 0.0))
+    even = even_index(rows)
+    directions = find_directions(
+        field, take_rows(rows, even), pose, jax.tree.map(lambda part: part[even], here)
+    )
+    index = _most_informative(tolerate(here, rows, _SELECTED_M), rows, directions)
+    width = here.width[index]
+    share = share_of_map(jnp.sum(width), jnp.sum(width > 0))
+    return Selection(index, take_rows(rows, index)._replace(share=share), directions)
+
+
+def _most_informative(residuals: Residuals, rows: Rows, directions: Directions) -> jax.Array:
+    """Draws the numbers of the rows that determine the pose best, (K,) int32."""
+    whole = jnp.arange(min(_FINE_ROWS, len(rows.some)), dtype=jnp.int32)
+    if len(rows.some) <= _FINE_ROWS:
+        return whole
     information = information_of(residuals)
     # Free directions must not draw all rows.
     held = jnp.where(directions.free, jnp.trace(information), 0)
@@ -218,7 +247,7 @@ def select_rows(field: Field | Baked, rows: Rows, pose: jax.Array) -> tuple[jax.
     information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6, dtype=jnp.float32)
     row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
     # A small cloud that is padded gives the same pose as without padding.
-    return jnp.where(jnp.sum(rows.some) <= _FINE_ROWS, whole, row), directions
+    return jnp.where(jnp.sum(rows.some) <= _FINE_ROWS, whole, row)
 
 
 class Solution(NamedTuple):
