@@ -23,6 +23,7 @@ from voxels import (
 )
 
 from hiosdf_jax._src.grid import evidence, lookup, patches
+from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state import NO_FEATURE, Side, surface_of
 
@@ -281,3 +282,22 @@ def test_the_kernel_of_a_gpu_answers_as_xla_does(room, monkeypatch):
     clear()
     for value, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(value, other, atol=1e-4)
+
+
+def test_several_maps_of_a_gpu_are_looked_up_under_a_condition(room, monkeypatch):
+    """Batched conditions batch the constants, too; jax refuses that where a kernel is chosen."""
+    expected = lookup.grid_sdf(CONFIG, surface_of(room), uniform(5, 300))
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
+    clear()
+    maps = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), surface_of(room))
+
+    def look(surface, chosen):
+        def answer():
+            return lookup.grid_sdf(CONFIG, surface, uniform(5, 300))
+
+        return jax.lax.cond(chosen, answer, lambda: jnp.zeros(300))
+
+    found = jax.jit(jax.vmap(look))(maps, jnp.array([True, False]))
+    clear()
+    np.testing.assert_allclose(found[0], expected, atol=1e-5)
+    np.testing.assert_array_equal(found[1], 0)

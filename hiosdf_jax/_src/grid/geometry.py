@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.numerics.barriers import differentiate_once, in_kernel
+from hiosdf_jax._src.numerics import devices
+from hiosdf_jax._src.numerics.barriers import differentiate_once
 from hiosdf_jax._src.numerics.vectors import Vector, each
 
 type Start = tuple[jax.Array | np.int32, ...]
@@ -196,7 +197,7 @@ def corners_of(config: Config, point: Vector) -> Corners:
     point = differentiate_once(each(lambda p: p / config.voxel_size - 0.5, point))
     shape = 8, *[1] * point[0].ndim
     number: Any = np.arange(8, dtype=np.int32).reshape(shape)
-    if in_kernel():  # takes no arrays of constants
+    if devices.has_kernels():  # neither they nor their batching take arrays of constants
         number = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
 
     upper = each(lambda bit: (number >> bit) & 1, (2, 1, 0))

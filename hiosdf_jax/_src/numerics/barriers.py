@@ -24,11 +24,6 @@ def no_barriers() -> Iterator[None]:
         _barred.reset(token)
 
 
-def in_kernel() -> bool:
-    """Returns whether what is traced becomes a kernel of ours, see `no_barriers`."""
-    return not _barred.get()
-
-
 def compute_once(tree: Any) -> Any:
     """Has arrays computed once, however many others are computed from them.
 
