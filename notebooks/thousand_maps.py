@@ -40,7 +40,7 @@ MAPS, SCANS, RAYS = 1024, 4, 128
 # ## A small map
 # On two CPU cores the maps have to be small: 1,024 rooms of at most 3 x 3 x 1.5 m with voxels of
 # 25 cm, and a network of 16 units. A GPU has room for more: 1,024 maps with 32,000 voxels each take
-# [47 ms per update of all](../benchmarks/README.md#speed) on an H100.
+# [43 ms per update of all](../benchmarks/README.md#speed) on an H100.
 
 # %%
 config = hio.Config.light(
