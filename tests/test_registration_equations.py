@@ -11,7 +11,7 @@ from interpreted import clear, interpret_point_kernels
 from room import CONFIG, HALF, room_cloud
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.registration import comparing, equations
+from hiosdf_jax._src.mapping.registration import comparing, equations, solving
 from hiosdf_jax._src.mapping.registration.comparing import compare, make_rows
 from hiosdf_jax._src.state import field_of
 
@@ -73,6 +73,26 @@ def test_a_tolerance_can_be_added_later(sharp_map, growing, scale_m):
     assert float(jnp.mean(later.comparable)) > 0.3
     for name, one, other in zip(later._fields, later, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("count", [COUNT, 5000])  # fewer and more than fine steps use
+def test_the_share_of_selected_returns_is_that_of_a_comparison(sharp_map, count, monkeypatch):
+    def mean_width(width, count):
+        return width / jnp.maximum(count, 1)  # the share is limited to 1 here
+
+    monkeypatch.setattr(solving, "share_of_map", mean_width)
+    monkeypatch.setattr(comparing, "share_of_map", mean_width)
+    field, (cloud, pose) = field_of(sharp_map), room_cloud(70, count)
+    rows = make_rows(jnp.asarray(cloud), jnp.ones(count, bool), (0.01, 0.0))
+
+    def shares():
+        selected = solving.select_rows(field, rows, jnp.asarray(pose))
+        measured = comparing.measure_share(field, selected.rows, jnp.asarray(pose))
+        return selected.rows.share, measured.share
+
+    found, expected = jax.jit(shares)()
+    assert float(found) > 0
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def on_wall():
