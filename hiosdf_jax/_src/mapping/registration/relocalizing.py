@@ -136,7 +136,7 @@ def relocalize(
 
     Example:
         >>> place = hio.relocalize(hio.load("map.npz"), cloud, jax.random.key(0))
-        >>> sure = place.best.converged & (place.score > place.other_score + 0.2)
+        >>> sure = place.best.converged & (place.score > place.other_score + 0.1)
     """
     field = as_field(field)
     if hypotheses is None:
