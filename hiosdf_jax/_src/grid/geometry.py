@@ -197,7 +197,7 @@ def corners_of(config: Config, point: Vector) -> Corners:
     point = differentiate_once(each(lambda p: p / config.voxel_size - 0.5, point))
     shape = 8, *[1] * point[0].ndim
     number: Any = np.arange(8, dtype=np.int32).reshape(shape)
-    if devices.has_kernels():  # neither they nor their batching take arrays of constants
+    if devices.has_kernels():  # see `by_points`; elsewhere XLA folds what constants determine
         number = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
 
     upper = each(lambda bit: (number >> bit) & 1, (2, 1, 0))

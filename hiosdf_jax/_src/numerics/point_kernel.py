@@ -63,7 +63,8 @@ def by_points(
         function: A function of a module. It maps `static`, `tables`, the numbers if there are any,
             and a tuple of K arrays (...) for each array of rows, to a pytree of arrays (...) and
             tuples of them. It reads tables by one array of indices, after `ravel` or `reshape`, or
-            by `vectors.take`.
+            by `vectors.take`. It holds no arrays of constants, which neither the kernel nor its
+            batching takes.
         static: A hashable argument, such as a configuration.
         tables: A pytree of arrays.
         *rows: Arrays (..., K), all with the same axes (...).
