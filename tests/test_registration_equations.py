@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from interpreted import clear, interpret_point_kernels
 from room import CONFIG, HALF, room_cloud
+from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.registration import comparing, equations, solving
@@ -206,6 +207,45 @@ def test_without_directions_a_step_is_that_along_the_axes(with_prior):
         slope += 3 * np.array([-0.1, 0, 0, 0, 0, 0])
     wanted = -np.linalg.solve(information, slope) / np.asarray(comparing.units(rows))
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
+
+
+def random_problem(seed, free):
+    """Returns the sums of random returns, directions, some of them free, a prior, and a pose."""
+    rng = np.random.default_rng(seed)
+
+    def pose(size):
+        result = np.eye(4)
+        turn = Rotation.from_rotvec(size * rng.normal(size=3)).as_matrix()
+        result[:3] = np.column_stack([turn, size * rng.normal(size=3)])
+        return jnp.float32(result)
+
+    slopes, root = rng.normal(size=(30, 6)), 30 * rng.normal(size=(6, 6))
+    lower = (slopes.T @ slopes)[tuple(np.transpose(comparing.LOWER))]
+    values = 1e4 * np.concatenate([lower, rng.normal(size=6) / 30, np.ones(4)])
+    basis, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    directions = equations.Directions(jnp.float32(basis), jnp.arange(6) < free)
+    anchor = equations.Anchor(pose(0.1), jnp.float32(root @ root.T))
+    return comparing.Sums(jnp.float32(values)), directions, anchor, pose(0.1)
+
+
+def test_a_step_with_directions_solves_the_equations_in_float64():
+    """Two directions are free: the returns tell nothing there, and the prior decides."""
+    sums, directions, anchor, pose = random_problem(5, free=2)
+    rows = comparing.make_rows(jnp.ones((9, 3)), jnp.ones(9, bool), (0.01, 0.001))
+    found = equations.find_step(sums, directions, anchor, rows, pose, 2.0)
+    basis, bound = np.asarray(directions.basis, float), np.arange(6) >= 2
+    information = np.zeros((6, 6))
+    for (i, j), value in zip(comparing.LOWER, np.asarray(sums.information, float), strict=True):
+        information[i, j] = information[j, i] = value / 2
+    projector = basis[:, bound] @ basis[:, bound].T
+    units = np.asarray(comparing.units(rows), float)
+    first, second = np.asarray(anchor.pose, float), np.asarray(pose, float)
+    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+    away = units * np.concatenate([second[:3, 3] - first[:3, 3], turn])
+    prior = np.asarray(anchor.information, float)
+    matrix = projector @ information @ projector + prior
+    slope = projector @ np.asarray(sums.slope, float) / 2 + prior @ away
+    np.testing.assert_allclose(found, -np.linalg.solve(matrix, slope) / units, rtol=2e-3, atol=1e-6)
 
 
 def test_the_kernel_of_a_gpu_sums_what_arrays_sum(sharp_map, monkeypatch):
