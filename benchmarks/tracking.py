@@ -4,6 +4,7 @@
     python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --poses none --kiss-icp
     python -m benchmarks.tracking --stream demo --frames 240 --poses exact drift none --kiss-icp
     python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --relocalize 100
+    python -m benchmarks.tracking --stream house_depth.npz --relocalize 30 --mapped 60
     python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --wrong-poses
 
 `--poses` says what is done to the stream's poses before they are refined:
@@ -17,6 +18,11 @@
 - `drift known`: the same, and what they predict is a prior. Its standard deviations per axis are
   1 % of the way and 0.2 degrees per meter
 - `none`: only the first is used
+
+`--relocalize` searches random frames. `--mapped` maps only the first ones, and searches the others:
+some of them are at places that the map does not know. `--map` takes a saved map, for instance of
+another place. It prints how many right and wrong places have converged, and how many of these are
+sure: `score` exceeds `other_score` by more than 0.1.
 
 `--wrong-poses` refines each third frame from poses that are 1 m off, in the map before it.
 
@@ -68,8 +74,9 @@ GLITCH = range(60, 65)
 # A pose is wrong if it is farther than this from the right one, m.
 WRONG_M = 0.3
 
-# A frame counts as found within this, m and degrees.
+# A frame counts as found within this, m and degrees. A place is sure if its margin is larger.
 FOUND = 0.05, 1.0
+SURE_MARGIN = 0.1
 
 
 def change(exact, mode, seed=0):
@@ -219,32 +226,37 @@ def _refine_from(state, cloud, start):
     return found, max(way_and_angle(found.pose, start)) <= MOST_MOVED * GROWING_REACH_M
 
 
-def print_relocalization(stream, frames, state, count, up_world):
-    """Finds frames in a map, and prints how many were found and those that were not."""
-    rng = np.random.default_rng(0)
-    field, seconds, good = hio.snapshot(state), [], 0
-    picks = rng.permutation(len(frames))[:count]
-    for k, i in enumerate(picks):
+def print_relocalization(stream, frames, numbers, field, up_world):
+    """Finds frames in a map, and prints how many were found, and how sure the places are."""
+    rng, seconds, places = np.random.default_rng(0), [], []
+    for i in numbers:
         cloud, pose = frames[i]
         # An accelerometer that is off by a degree.
         tilt = perturb(np.eye(4), rng, 0.0, 1.0)[:3, :3]
         up_sensor = tilt @ pose[:3, :3].T @ up_world
         begin = time.perf_counter()
         place = hio.relocalize(
-            field, cloud, jax.random.key(k), up_sensor=up_sensor, up_world=up_world
+            field, cloud, jax.random.key(i), up_sensor=up_sensor, up_world=up_world
         )
         jax.block_until_ready(place)
         seconds.append(time.perf_counter() - begin)
         away = error(place.best.pose, pose)
         way, angle = np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))
-        if way < FOUND[0] and angle < FOUND[1]:
-            good += 1
-        else:
+        right, score, other = way < FOUND[0] and angle < FOUND[1], place.score, place.other_score
+        sure = bool(place.best.converged) and float(score - other) > SURE_MARGIN
+        places.append([right, bool(place.best.converged), sure])
+        if not right:
             print(
-                f"frame {i}: {way:.2f} m and {angle:.1f} deg off, score {float(place.score):.2f}, "
-                f"other {float(place.other_score):.2f}"
+                f"frame {i}: {way:.2f} m and {angle:.1f} deg off, score {float(score):.2f}, "
+                f"other {float(other):.2f}"
             )
-    print(f"{stream}: {good} of {len(picks)} found, {np.median(seconds[1:]):.2f} s each (median)")
+    places = np.array(places)
+    right, wrong = places[places[:, 0]], places[~places[:, 0]]
+    print(
+        f"{stream}: {len(right)} of {len(places)} found, {right[:, 1].sum()} of them converged and "
+        f"{right[:, 2].sum()} sure; of {len(wrong)} wrong places {wrong[:, 1].sum()} converged and "
+        f"{wrong[:, 2].sum()} sure; {np.median(seconds[1:]):.2f} s each (median)"
+    )
 
 
 def main():
@@ -254,8 +266,9 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="of the jitter")
     parser.add_argument("--order", type=int, default=0, help="seed to shuffle the clouds' rows by")
     parser.add_argument("--relocalize", type=int, default=0, help="frames to find")
-    parser.add_argument("--wrong-poses", action="store_true", help="see above")
+    parser.add_argument("--mapped", type=int, help="map this many frames and find others")
     parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
+    parser.add_argument("--wrong-poses", action="store_true", help="see above")
     parser.add_argument(
         "--frames", type=int, help="use only the first ones; the demo has this many"
     )
@@ -285,13 +298,16 @@ def main():
         if arguments.map:
             state = hio.load(arguments.map)
         else:
-            state = map_stream(frames, config, "exact")[0]
+            state = map_stream(frames[: arguments.mapped], config, "exact")[0]
         up_world = np.array([0, 0, 1.0])
         if not is_demo:
             with np.load(arguments.stream) as file:
                 up_world = file.get("floor_normal", up_world)
         up_world = up_world * np.sign(up_world[2]) / np.linalg.norm(up_world)
-        print_relocalization(name, frames, state, arguments.relocalize, up_world)
+        first = arguments.mapped or 0
+        others = first + np.random.default_rng(0).permutation(len(frames) - first)
+        numbers = others[: arguments.relocalize].tolist()
+        print_relocalization(name, frames, numbers, hio.snapshot(state), up_world)
 
 
 if __name__ == "__main__":
