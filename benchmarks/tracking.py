@@ -64,8 +64,7 @@ MODES = (
     "none",
 )
 DRIFT = 0.01, 0.05  # of the way, degrees per meter
-STEP_DEVIATION = 0.01, np.radians(0.2)  # of odometry, per axis and meter of the way
-LEAST_WAY_M = 0.05  # shorter ways count as this long
+KNOWN_DRIFT = 0.01, 0.2  # standard deviations per axis: of the way, degrees per meter
 JITTER = 0.02, 1.0  # m, degrees
 JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 2 / 3)
 MAPPED_AGAIN = 3
@@ -101,9 +100,9 @@ def change(exact, mode, seed=0):
 def map_stream(frames, config, mode, seed=0):
     """Maps frames; returns the map, the poses at which they were fused, and who was refused."""
     given = change([pose for _, pose in frames], mode, seed)
-    tracker = Tracker(odometry=mode == "none")
+    tracker = Tracker(mode == "none", KNOWN_DRIFT if mode == "drift known" else None)
     state = hio.init(config, jax.random.key(0))
-    poses, refused, last = [], [], 0  # the last registered frame
+    poses, refused = [], []
     for i, (cloud, _) in enumerate(frames):
         pose, fused = given[i], True
         if mode == "glitch left out" and i in GLITCH:
@@ -111,14 +110,6 @@ def map_stream(frames, config, mode, seed=0):
             continue
         if mode == "exact" or mode.endswith("unrefined"):
             state = hio.update(state, cloud, pose)
-        elif mode == "drift known":
-            predicted = hio.predict_pose(poses[last], given[last], pose) if i else pose
-            way_m = np.linalg.norm(predicted[:3, 3] - poses[last][:3, 3]) if i else 0
-            deviation = max(way_m, LEAST_WAY_M) * np.repeat(STEP_DEVIATION, 3)
-            prior = predicted, np.diag(deviation**2)
-            state, found = hio.track(state, cloud, predicted, prior)
-            pose, fused = found.pose, bool(found.converged)
-            last = i if fused else last
         elif mode.startswith("jitter"):
             known = (pose, JITTER_COVARIANCE) if mode == "jitter known" else None
             state, found = hio.track(state, cloud, pose, known)

@@ -1,7 +1,9 @@
 """Runs of the command that refine the poses of a stream, or use none of them."""
 
 import json
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -9,9 +11,10 @@ from room import room_cloud
 from room_files import BOX, use_room_config
 from scipy.spatial.transform import Rotation
 
-from hiosdf_jax._src.command import cli, map_stream
+from hiosdf_jax._src.command import cli, map_stream, tracker
 from hiosdf_jax._src.command.tracker import TRAJECTORY, without_flips
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
+from hiosdf_jax._src.mapping.registration.refining import Registration
 
 FRAMES = 15
 STILL = 7  # frames before the sensor moves: the small clouds of one make no map
@@ -67,13 +70,17 @@ def way_cm(poses, exact):
     return 100 * np.linalg.norm(poses[:, :3, 3] - exact[:, :3, 3], axis=-1)
 
 
-@pytest.mark.parametrize("option", ["--refine-poses", "--odometry"])
-def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, option):
+@pytest.mark.parametrize(
+    "options",
+    [["--refine-poses"], ["--refine-poses", "--drift", "0.5", "30"], ["--odometry"]],
+    ids=" ".join,
+)
+def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     clouds, exact = walk()
     given = drifting(exact)
     stream = write(tmp_path / "walk.npz", clouds, given)
     output, saved = tmp_path / "out", tmp_path / "map.npz"
-    arguments = ["map", stream, option, "--output", str(output), "--save", str(saved), *BOX]
+    arguments = ["map", stream, *options, "--output", str(output), "--save", str(saved), *BOX]
     assert cli.main(arguments) == 0
     assert {path.name for path in output.iterdir()} == {*TRAJECTORY, "metrics.json"}
     with np.load(output / "trajectory.npz") as file:
@@ -116,6 +123,51 @@ def test_such_a_run_cannot_be_resumed(tmp_path, capsys, option):
     assert cli.main(["map", str(tmp_path / "a.npz"), option, "--resume", "map.npz"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"hiosdf: --resume cannot be combined with {option}: maps have no poses"
+
+
+def test_the_prior_of_a_drift_grows_with_the_way(monkeypatch):
+    """Frames that turn, and are 0, 2 cm and 0.5 m from the one before."""
+    priors = []
+
+    def note(state, cloud, predicted, prior):
+        priors.append(prior)
+        zero = jnp.float32(0)
+        return state, Registration(predicted, jnp.eye(6), zero, zero, jnp.asarray(True))
+
+    monkeypatch.setattr(tracker, "track", note)
+    tracked: Any = tracker.Tracker(odometry=False, drift=(0.01, 0.2))
+    given = np.stack([np.eye(4)] * 4)
+    given[:, 0, 3] = [0, 0, 0.02, 0.52]
+    given[3, :3, :3] = Rotation.from_euler("z", 0.3).as_matrix()
+    for i, pose in enumerate(given):
+        tracked.fuse(None, None, pose, i)
+    assert priors[0] is None
+    for (mean, covariance), pose, way_m in zip(
+        priors[1:], given[1:], (0.05, 0.05, 0.5), strict=True
+    ):
+        np.testing.assert_allclose(mean, pose, atol=1e-6)
+        deviation = way_m * np.array([0.01] * 3 + [np.radians(0.2)] * 3)
+        np.testing.assert_allclose(covariance, np.diag(deviation**2), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--drift", "0.01", "0.2"], "--drift needs --refine-poses"),
+        (["--odometry", "--drift", "0.01", "0.2"], "--drift needs --refine-poses"),
+        (
+            ["--refine-poses", "--drift", "0.01", "0"],
+            "--drift is [0.01, 0.0], expected two numbers > 0",
+        ),
+        (
+            ["--refine-poses", "--drift", "nan", "1"],
+            "--drift is [nan, 1.0], expected two numbers > 0",
+        ),
+    ],
+)
+def test_a_drift_that_means_nothing_is_refused(tmp_path, capsys, options, message):
+    assert cli.main(["map", str(tmp_path / "a.npz"), *options]) == 2
+    assert capsys.readouterr().err == f"hiosdf: {message}\n"
 
 
 def test_the_options_exclude_each_other(tmp_path, capsys):

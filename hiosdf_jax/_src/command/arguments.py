@@ -47,8 +47,9 @@ examples:
   hiosdf map drive/ --save map.npz --checkpoint-every 100
   hiosdf map drive/ --save map.npz --resume map.npz
       write the map after every 100 updates, and continue it after a stop or a crash
-  hiosdf map drive/ --refine-poses
-      poses that drift: also writes trajectory.txt, trajectory.npz and trajectory.png
+  hiosdf map drive/ --refine-poses --drift 0.01 0.2
+      poses that drift by 1 % of the way and 0.2 degrees per meter: also writes trajectory.txt,
+      trajectory.npz and trajectory.png
 
 The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
@@ -244,6 +245,14 @@ def parser_of(
         "--odometry",
         action="store_true",
         help="use only the first pose of the stream, and find the others by the map",
+    )
+    map_.add_argument(
+        "--drift",
+        type=float,
+        nargs=2,
+        metavar=("SHARE", "DEG"),
+        help="with --refine-poses: how far the motion between poses is off, as standard "
+        "deviations, a share of the way and degrees per meter, such as 0.01 0.2",
     )
 
     size = map_.add_argument_group("size of the map")

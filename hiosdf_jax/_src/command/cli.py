@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 import os
 import signal
 import sys
@@ -170,6 +171,10 @@ def _map(options: argparse.Namespace) -> None:
     tracking = "--odometry" if options.odometry else "--refine-poses"
     if options.resume is not None and (options.odometry or options.refine_poses):
         raise Failure(f"--resume cannot be combined with {tracking}: maps have no poses", BAD_INPUT)
+    if options.drift is not None and not options.refine_poses:
+        raise Failure("--drift needs --refine-poses", BAD_INPUT)
+    if options.drift is not None and not all(0 < each < math.inf for each in options.drift):
+        raise Failure(f"--drift is {options.drift}, expected two numbers > 0", BAD_INPUT)
     output = options.output or _OUTPUT / (place.name if place.is_dir() else place.stem)
     check_outputs(options, output)
     if options.ground_truth is not None and not options.ground_truth.exists():
@@ -213,7 +218,7 @@ def _tracker(options: argparse.Namespace) -> Tracker | None:
         return None
     from hiosdf_jax._src.command.tracker import Tracker
 
-    return Tracker(options.odometry)
+    return Tracker(options.odometry, options.drift)
 
 
 def _view(options: argparse.Namespace) -> None:

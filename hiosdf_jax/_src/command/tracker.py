@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
+from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
-from hiosdf_jax._src.mapping.tracking import predict_pose, track
+from hiosdf_jax._src.mapping.tracking import (
+    MOST_MOVED,
+    predict_pose,
+    prior_of_prediction,
+    track,
+)
 from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.state import MapState
 from hiosdf_jax._src.view.paths import save_paths
 
 TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")
+
+_LEAST_WAY_M = 0.05  # shorter ways drift as this one
 
 
 class Tracked(NamedTuple):
@@ -46,14 +56,18 @@ class Tracker:
         frames: The frames so far, a `Tracked` each.
     """
 
-    def __init__(self, odometry: bool) -> None:
+    def __init__(self, odometry: bool, drift: Sequence[float] | None = None) -> None:
         """Begins before the first frame.
 
         Args:
             odometry: Use no pose of the stream but the first.
+            drift: Standard deviations of the stream's motion: a share of the way, and degrees per
+                meter. Then predicted poses are priors. By default they are as exact as `track`
+                assumes.
         """
         self.frames: list[Tracked] = []
         self._odometry = odometry
+        self._drift = drift
         self._reference: Tracked | None = None  # the last registered frame
 
     def predict(self, given: np.ndarray) -> np.ndarray:
@@ -66,12 +80,21 @@ class Tracker:
         before, last = self.frames[-2:] if len(self.frames) > 1 else 2 * self.frames
         return np.asarray(predict_pose(last.pose, before.pose, last.pose))
 
+    def prior_of(self, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns the prior of a predicted pose (4, 4), or None where the drift is not known."""
+        if self._drift is None or self._reference is None:
+            return None
+        share, degrees = self._drift
+        way_m = np.linalg.norm(predicted[:3, 3] - self._reference.pose[:3, 3])
+        deviation = max(float(way_m), _LEAST_WAY_M) * np.repeat([share, np.radians(degrees)], 3)
+        return predicted, np.diag(deviation**2)
+
     def fuse(
         self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
     ) -> tuple[MapState, np.ndarray]:
         """Registers a frame and fuses it if it fits; returns the map and the pose (4, 4)."""
         predicted = self.predict(given)
-        state, found = track(state, cloud, predicted)
+        state, found = track(state, cloud, predicted, self.prior_of(predicted))
         return state, self._add(frame, given, predicted, found)
 
     def locate(
@@ -79,8 +102,12 @@ class Tracker:
     ) -> np.ndarray:
         """Registers a frame that the map is not given; returns the pose (4, 4)."""
         predicted = self.predict(given)
-        found = refine_pose(state, cloud, predicted, reach_m=GROWING_REACH_M, starts=1)
-        return self._add(frame, given, predicted, found)
+        prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
+        found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
+        near = (
+            max(way_and_angle(found.pose, jnp.asarray(predicted))) <= MOST_MOVED * GROWING_REACH_M
+        )
+        return self._add(frame, given, predicted, found._replace(converged=found.converged & near))
 
     def counts(self) -> dict[str, int]:
         """How many frames fit the map, and how many did not, by the keys of `metrics.json`."""
