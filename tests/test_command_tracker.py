@@ -11,6 +11,7 @@ from room import room_cloud
 from room_files import BOX, use_room_config
 from scipy.spatial.transform import Rotation
 
+from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.command import cli, map_stream, tracker
 from hiosdf_jax._src.command.tracker import TRAJECTORY, without_flips
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
@@ -86,7 +87,8 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     with np.load(output / "trajectory.npz") as file:
         poses, covariance, registered = file["poses"], file["covariance"], file["registered"]
         np.testing.assert_array_equal(file["frame"], np.arange(FRAMES))
-    assert registered.all()
+    assert registered[0]
+    assert registered[CONFIDENT_UPDATES:].all()
     assert way_cm(given, exact).max() > 6.9
     assert way_cm(poses, exact).max() < 3
     assert covariance.shape == (FRAMES, 6, 6)
@@ -95,13 +97,25 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
         np.testing.assert_allclose(pose_at(text, i, 0.1), poses[i], atol=1e-5)
     assert imread(output / "trajectory.png").std() > 0.05
     metrics = json.loads((output / "metrics.json").read_text("utf-8"))
-    counts = metrics["frames_registered"], metrics["frames_not_registered"]
-    assert counts == (FRAMES, 0)
-    assert f"{FRAMES} poses were refined, 0 were not" in capsys.readouterr().out
+    names = "frames_registered", "frames_as_predicted", "frames_not_registered", "lost_since"
+    trusted = int((~registered).sum())
+    assert [metrics[name] for name in names] == [FRAMES - trusted, trusted, 0, None]
+    assert f"{FRAMES - trusted} poses were refined, 0 were not" in capsys.readouterr().out
     # The map has no poses, from which a run could continue.
     plain = ["map", stream, "--output", str(output), "--resume", str(saved), *BOX]
     assert cli.main(plain) == 2
     assert "does not say how far the map has come" in capsys.readouterr().err
+
+
+def test_a_stream_that_is_lost_says_since_when(tmp_path, quick, capsys):
+    clouds, exact = walk()
+    for i in (7, *range(10, FRAMES)):
+        clouds[i] = np.random.default_rng(i).normal(size=clouds[i].shape)
+    stream, output = write(tmp_path / "walk.npz", clouds, exact), tmp_path / "out"
+    assert cli.main(["map", stream, "--refine-poses", "--output", str(output), *BOX]) == 0
+    metrics = json.loads((output / "metrics.json").read_text("utf-8"))
+    assert (metrics["frames_not_registered"], metrics["lost_since"]) == (FRAMES - 9, 10)
+    assert "lost since frame 10: frames must overlap" in capsys.readouterr().out
 
 
 def test_a_frame_of_another_place_is_left_out(tmp_path, quick):
@@ -111,7 +125,8 @@ def test_a_frame_of_another_place_is_left_out(tmp_path, quick):
     output = tmp_path / "out"
     assert cli.main(["map", stream, "--refine-poses", "--output", str(output), *BOX]) == 0
     with np.load(output / "trajectory.npz") as file:
-        assert list(np.flatnonzero(~file["registered"])) == [12]
+        late = file["registered"][CONFIDENT_UPDATES:]
+        assert list(CONFIDENT_UPDATES + np.flatnonzero(~late)) == [12]
         assert way_cm(file["poses"], exact).max() < 3
     metrics = json.loads((output / "metrics.json").read_text("utf-8"))
     assert metrics["updates"] == FRAMES - 1

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.axes import Axes
 
 from hiosdf_jax._src.view import drawing
+from hiosdf_jax._src.view.leveling import world_from_level
+from hiosdf_jax._src.view.paths import save_paths
 
 
 def test_heights_of_the_slices():
@@ -32,7 +35,32 @@ def test_a_map_without_surface_writes_no_mesh(tmp_path, capsys):
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0.6, 0, -0.8], [0, 0, -1]])
 def test_the_turn_maps_z_to_up(up):
-    turn = drawing._turn_to(np.array(up, float))
+    turn = world_from_level(np.array(up, float))
     np.testing.assert_allclose(turn @ [0, 0, 1], up, atol=1e-12)
     np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_a_world_that_is_tilted_by_a_degree_is_drawn_as_it_is():
+    up = np.array([0, np.sin(np.radians(1)), np.cos(np.radians(1))])
+    np.testing.assert_array_equal(world_from_level(up), np.eye(3))
+    assert not np.array_equal(world_from_level(np.array([0, 0.1, 0.995])), np.eye(3))
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [-0.01, -0.894, -0.447]])
+def test_a_path_is_drawn_from_above_and_not_mirrored(tmp_path, monkeypatch, up):
+    """A sensor that turns left about the vertical turns left in the picture."""
+    up = np.array(up) / np.linalg.norm(up)
+    first = np.cross(up, [1.0, 0.2, 0.1])
+    ways = np.stack([first, np.cross(up, first)])  # the second one is to the left
+    path = np.cumsum(np.vstack([np.zeros(3), ways]), axis=0)
+    drawn, plot = [], Axes.plot
+
+    def note(self, *values, **options):
+        drawn.append(values)
+        return plot(self, *values, **options)
+
+    monkeypatch.setattr(Axes, "plot", note)
+    save_paths(tmp_path / "path.png", path, path, np.ones(3, bool), np.ones(3), up)
+    (x, y) = (np.diff(values) for values in drawn[0])
+    assert x[0] * y[1] - x[1] * y[0] > 0

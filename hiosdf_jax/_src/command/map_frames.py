@@ -166,6 +166,8 @@ def fuse_frames(
         updates = int(state.updates)
         start = time.perf_counter()
         if i >= first:
+            if not seconds:
+                bar.set_postfix_str("compiling")
             if tracker is not None:
                 state, pose = tracker.fuse(state, cloud, pose, i)
             else:
@@ -178,6 +180,7 @@ def fuse_frames(
         seconds.append(time.perf_counter() - start)
         if len(seconds) == 1:
             return_freed_memory()
+            bar.unpause()  # the rate is that of the other frames
         if int(state.updates) > updates:  # a refused cloud leaves the numbers of the one before it
             points_used += int(state.report.points_used)
             points_outside += int(state.report.points_outside)

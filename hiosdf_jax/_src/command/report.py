@@ -77,6 +77,13 @@ def summarize(metrics: dict[str, Any]) -> str:
     if "frames_registered" in metrics:
         missed = metrics["frames_not_registered"]
         lines.append(f"{metrics['frames_registered']} poses were refined, {missed} were not")
+        if metrics["frames_as_predicted"]:
+            lines[-1] += f", {metrics['frames_as_predicted']} of a young map are as predicted"
+        if metrics["lost_since"] is not None:
+            lines.append(
+                f"lost since frame {metrics['lost_since']}: frames must overlap, and be within "
+                "about 10 cm and 5 degrees of their prediction"
+            )
     if metrics["stopped_by"]:
         lines.append(f"ended early by {metrics['stopped_by']}")
     for flag in metrics["flags"]:

@@ -25,6 +25,7 @@ from hiosdf_jax._src.view.paths import save_paths
 TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")
 
 _LEAST_WAY_M = 0.05  # shorter ways drift as this one
+_LOST_FRAMES = 5  # a stream is lost if this many frames at its end do not fit
 
 
 class Tracked(NamedTuple):
@@ -35,7 +36,9 @@ class Tracked(NamedTuple):
         given: (4, 4) T_world_sensor, as the stream has it.
         pose: (4, 4) T_world_sensor, as the map has it; predicted, if the frame is not registered.
         covariance: (6, 6) of the pose's error, m and rad, see `Registration`.
-        registered: Whether the frame fits the map there.
+        registered: Whether the map determined the pose. That of the first frame defines the map.
+        fused: Whether `pose` may serve to predict others: it is registered, or the map was young
+            and fused the frame where it was predicted.
     """
 
     frame: int
@@ -43,6 +46,7 @@ class Tracked(NamedTuple):
     pose: np.ndarray
     covariance: np.ndarray
     registered: bool
+    fused: bool
 
 
 class Tracker:
@@ -68,7 +72,7 @@ class Tracker:
         self.frames: list[Tracked] = []
         self._odometry = odometry
         self._drift = drift
-        self._reference: Tracked | None = None  # the last registered frame
+        self._reference: Tracked | None = None  # the last frame that fits
 
     def predict(self, given: np.ndarray) -> np.ndarray:
         """Predicts the pose of the next frame from the pose (4, 4) that the stream gives it."""
@@ -109,12 +113,21 @@ class Tracker:
         )
         return self._add(frame, given, predicted, found._replace(converged=found.converged & near))
 
-    def counts(self) -> dict[str, int]:
-        """How many frames fit the map, and how many did not, by the keys of `metrics.json`."""
+    def counts(self) -> dict[str, int | None]:
+        """How the frames fit the map, by the keys of `metrics.json`.
+
+        `lost_since` is the first of at least five frames at the end of the stream that did not fit,
+        or None.
+        """
         registered = sum(each.registered for each in self.frames)
+        fused = sum(each.fused for each in self.frames)
+        fitting = [k for k, each in enumerate(self.frames) if each.fused]
+        missed = self.frames[fitting[-1] + 1 if fitting else 0 :]
         return {
             "frames_registered": registered,
-            "frames_not_registered": len(self.frames) - registered,
+            "frames_as_predicted": fused - registered,
+            "frames_not_registered": len(self.frames) - fused,
+            "lost_since": missed[0].frame if len(missed) >= _LOST_FRAMES else None,
         }
 
     def write(self, folder: Path, up_world: np.ndarray) -> None:
@@ -150,11 +163,14 @@ class Tracker:
     def _add(
         self, frame: int, given: np.ndarray, predicted: np.ndarray, found: Registration
     ) -> np.ndarray:
-        registered = bool(found.converged)
-        pose: Any = found.pose if registered else predicted
-        tracked = Tracked(frame, given, np.asarray(pose), np.asarray(found.covariance), registered)
+        fused = bool(found.converged)
+        pose: Any = np.asarray(found.pose if fused else predicted)
+        # A pose that was refined differs from its prediction, if only in its last digits.
+        registered = fused and (not self.frames or not np.array_equal(pose, predicted))
+        covariance = np.asarray(found.covariance)
+        tracked = Tracked(frame, given, pose, covariance, registered, fused)
         self.frames.append(tracked)
-        if registered:
+        if fused:
             self._reference = tracked
         return tracked.pose
 

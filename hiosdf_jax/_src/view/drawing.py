@@ -11,6 +11,7 @@ import numpy as np
 from hiosdf_jax._src.field import mesh
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.output_files import replacing
+from hiosdf_jax._src.view.leveling import world_from_level
 from hiosdf_jax._src.view.shading import save_shaded
 from hiosdf_jax._src.view.slices import save_slices
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     import trimesh
 
 _LEVEL = np.radians(10)  # floors and tables have normals within this angle of upward
-_TILTED = np.radians(2)  # a world whose z is farther than this from upward is leveled to draw it
 _MARGIN = 0.2  # m, around a leveled world
 _HEADROOM = 2.5  # m above the sensor; rooms are lower, and a slice up there shows little
 
@@ -99,16 +99,15 @@ def _draw_slices(
 ) -> None:
     """Draws horizontal slices, in the world frame or, if that is tilted, in a leveled one."""
     bounds: Sequence[Sequence[float]] = queries.field.config.bounds
-    tilted = up_world[2] < np.cos(_TILTED)
-    world_from_level = _turn_to(up_world) if tilted else np.eye(3)
-    path = path_world @ world_from_level
-    solid = np.asarray(surface.vertices if len(surface.faces) else bounds) @ world_from_level
-    if tilted:
+    rotation = world_from_level(up_world)
+    path = path_world @ rotation
+    solid = np.asarray(surface.vertices if len(surface.faces) else bounds) @ rotation
+    if not np.array_equal(rotation, np.eye(3)):
         print("the world's z does not point up: slices.png is drawn in a leveled frame")
         corners = np.concatenate([solid, path])
         bounds = np.stack([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]).tolist()
     low, high = np.percentile(solid[:, 2], [2, 98])  # floor and ceiling, without specks
-    turn = world_from_level.T.astype(np.float32)  # acts on rows
+    turn = rotation.T.astype(np.float32)  # acts on rows
     save_slices(
         file,
         lambda points: queries.sdf(points @ turn),
@@ -118,15 +117,6 @@ def _draw_slices(
         path_world=path,
         observed=lambda points: queries.observed(points @ turn),
     )
-
-
-def _turn_to(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation that maps z to a unit vector, (3, 3)."""
-    if up[2] < -1 + 1e-6:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, z = up
-    skew = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + z)
 
 
 def _write_mesh(folder: Path, surface: trimesh.Trimesh, up_world: np.ndarray) -> None:

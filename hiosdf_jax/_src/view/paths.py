@@ -7,6 +7,7 @@ import os
 import numpy as np
 
 from hiosdf_jax._src.output_files import replacing
+from hiosdf_jax._src.view.leveling import world_from_level
 
 _MOST_SPREAD_CM = 1000.0  # larger ones are of directions of which nothing is known
 
@@ -26,7 +27,7 @@ def save_paths(
         given_world: (F, 3) m, the sensor's positions before.
         refined_world: (F, 3) m, and after.
         registered: (F,) bool; the others are marked.
-        spread_cm: (F,) cm, standard deviation of the refined positions.
+        spread_cm: (F,) cm, standard deviation of the refined positions in the map.
         up_world: (3,) unit vector against gravity; the picture looks down along it.
 
     Raises:
@@ -34,8 +35,9 @@ def save_paths(
     """
     from matplotlib.figure import Figure  # not pyplot: draws with Agg
 
-    across = np.linalg.svd(up_world[None])[2][1:] if abs(up_world[2]) < 0.99 else np.eye(3)[:2]
-    given, refined = given_world @ across.T, refined_world @ across.T
+    rotation = world_from_level(up_world)
+    frame_name = "world" if np.array_equal(rotation, np.eye(3)) else "leveled"
+    given, refined = ((places @ rotation)[:, :2] for places in (given_world, refined_world))
     way_cm = 100 * np.linalg.norm(refined_world - given_world, axis=-1)
     frame = np.arange(len(refined))
 
@@ -46,7 +48,8 @@ def save_paths(
     above.plot(*refined[0], "o", color="tab:green", label="start")
     if not registered.all():
         above.plot(*refined[~registered].T, "x", color="tab:red", label="not registered")
-    above.set(xlabel="x, m", ylabel="y, m", title="from above", aspect="equal")
+    above.set(xlabel=f"x ({frame_name}), m", ylabel=f"y ({frame_name}), m", title="from above")
+    above.set_aspect("equal")
     above.set_adjustable("datalim")
     above.legend()
     over_time.plot(frame, way_cm, color="0.4", label="from the given to the refined position")
@@ -55,7 +58,7 @@ def save_paths(
         frame,
         np.where(known, spread_cm, np.nan),
         color="tab:blue",
-        label="standard deviation of the refined position",
+        label="standard deviation in the map",
     )
     over_time.set(xlabel="frame", ylabel="cm", title="corrections")
     over_time.margins(y=0.25)  # room for the legend
