@@ -98,6 +98,8 @@ def test_a_young_map_takes_no_cloud_that_update_refuses(empty_map):
     clouds, poses = (np.stack(part).astype(np.float32) for part in zip(*frames, strict=True))
     state, found = track_all(empty_map, clouds, poses)
     np.testing.assert_array_equal(found.converged, [False, False, False, True])
+    unknown = 100**2 * np.eye(6)
+    np.testing.assert_allclose(found.covariance, [unknown, unknown, unknown, 0 * unknown])
     assert int(state.updates) == 1
 
 

@@ -379,6 +379,47 @@ def test_a_pose_half_a_turn_from_its_prior_has_not_converged(room):
         assert bool(found.converged) == converged
 
 
+def test_a_pose_that_has_not_converged_has_the_derivatives_of_a_constant(room):
+    cloud = np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)
+    weight = np.ones((4, 4), np.float32)
+    found, slope = refine_and_slope(room, cloud, np.eye(4, dtype=np.float32), weight)
+    assert not bool(found.converged)
+    assert np.isfinite(found.pose).all()
+    np.testing.assert_array_equal(slope, 0)
+
+
+UNEQUAL = np.eye(6, k=1) * 0.3
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        np.zeros((6, 6)),
+        -1e4 * np.eye(6),
+        np.diag([1.0, 1, 1, 1, 1, -1]),
+        np.nan * np.eye(6),
+        np.eye(6) + 2 * (UNEQUAL + UNEQUAL.T) / 0.3,  # indefinite
+        np.eye(6) + UNEQUAL,  # not symmetric
+    ],
+)
+def test_no_pose_converges_by_a_prior_that_is_no_covariance(room, covariance):
+    """Inside jit, where no message is possible; derivatives stay finite."""
+    cloud, pose = room_cloud(0, COUNT)
+    given = np.float32(pose), np.float32(1e-4 * covariance)
+    weight = np.ones((4, 4), np.float32)
+    found, slope = refine_and_slope_with_prior(room, cloud, np.float32(pose), *given, weight)
+    assert not bool(found.converged)
+    assert np.isfinite(found.pose).all()
+    np.testing.assert_array_equal(slope, 0)
+
+
+@pytest.mark.parametrize("reach_m", [0.0, -1.0, np.nan, np.inf, 1e30])
+def test_no_pose_converges_by_a_reach_that_is_out_of_range(room, reach_m):
+    cloud, pose = room_cloud(0, COUNT)
+    found = jax.jit(lambda reach_m: hio.refine_pose(room, cloud, pose, reach_m=reach_m))(reach_m)
+    assert not bool(found.converged)
+
+
 def test_the_reach_has_a_gradient(room):
     """It is zero, but a loop that ends early has none in reverse mode."""
 
@@ -460,6 +501,7 @@ UNIT = np.eye(6)
         ({"prior": (np.eye(4), UNIT - 2 * np.eye(6, k=1) - 2 * np.eye(6, k=-1))}, "not positive"),
         ({"prior": (np.eye(4), np.diag([1, 1, 1, 1, 1, 0]))}, "not positive definite"),
         ({"reach_m": 1e-30}, "reach_m is 1e-30, expected >= 0.001"),
+        ({"reach_m": 1e20}, r"reach_m is 1e\+20, expected at most 100"),
         ({"prior": (BAD, UNIT)}, "prior: pose "),
         ({"prior": (np.eye(4), -UNIT)}, "prior covariance is not positive definite"),
         ({"prior": (np.eye(4), UNIT + np.eye(6, k=1))}, "prior covariance is not symmetric"),

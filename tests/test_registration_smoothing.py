@@ -213,6 +213,7 @@ def test_no_poses_and_one_pose():
         ({"motion_deviation": (0.0, 1.0)}, "motion_deviation is 0.0"),
         ({"motion_deviation": 0.1}, r"motion_deviation is 0.1, expected \(m, rad\)"),
         ({"motion_deviation": (0.1,)}, r"motion_deviation is \(0.1,\), expected \(m, rad\)"),
+        ({"motion_deviation": (1e-300, 1e-300)}, r"motion_deviation is \(1e-300, 1e-300\)"),
         ({"registered": [[True], []]}, "registered is no array"),
         ({"registered": [True]}, r"registered is bool \(1,\), expected bool \(3,\)"),
         ({"registered": [1, 0, 1]}, r"registered is int64 \(3,\), expected bool"),
@@ -222,6 +223,16 @@ def test_bad_arguments_are_named(changes, message):
     arguments = {"poses": path(3), "given_poses": path(3), "covariance": EQUAL} | changes
     with pytest.raises(ValueError, match=message):
         hio.smooth_poses(**arguments)
+
+
+def test_a_masked_frame_is_not_registered():
+    poses = path(3).astype(float)
+    poses[1, :3, 3] += 1
+    mask = np.ma.array([True, True, True], mask=[False, True, False])
+    masked, plain = (
+        hio.smooth_poses(poses, path(3), EQUAL, each) for each in (mask, np.array([1, 0, 1], bool))
+    )
+    np.testing.assert_array_equal(masked, plain)
 
 
 def test_traced_arguments_are_refused():

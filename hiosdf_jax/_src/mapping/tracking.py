@@ -98,8 +98,8 @@ def track(
     extras, donate = (None, checked_noise), donate and not traced
     state = run_update(state, fused_cloud, found.pose, extras, decision.flags, donate)
     # `update` may refuse what a young map takes on trust.
-    converged = _confirm_jit(found.converged, decision, state.updates)
-    return state, found._replace(converged=converged)
+    converged, covariance = _confirm_jit(found, decision, state.updates, own)
+    return state, found._replace(converged=converged, covariance=covariance)
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
@@ -192,7 +192,7 @@ def _register(
     # A young map may have too few surfaces to register a cloud, and would never get more.
     fused = registered | (updates < CONFIDENT_UPDATES)
     if own is None:
-        own = jnp.where(first, 0, _UNKNOWN_M**2) * jnp.eye(6, dtype=jnp.float32)
+        own = jnp.where(first, 0, _unknown())
     chosen = found._replace(
         pose=jnp.where(registered, found.pose, predicted),
         covariance=jnp.where(registered, found.covariance, own),
@@ -206,5 +206,15 @@ _register_jit = jax.jit(_register)
 
 
 @jax.jit
-def _confirm_jit(fused: jax.Array, decision: _Decision, updates: jax.Array) -> jax.Array:
-    return decision.registered | (fused & (updates == decision.updates_if_fused))
+def _confirm_jit(
+    found: Registration, decision: _Decision, updates: jax.Array, own: jax.Array | None
+) -> tuple[jax.Array, jax.Array]:
+    """Returns whether a cloud was registered or fused after all, and the covariance of its pose."""
+    converged = decision.registered | (found.converged & (updates == decision.updates_if_fused))
+    other = _unknown() if own is None else own
+    return converged, jnp.where(converged, found.covariance, other)
+
+
+def _unknown() -> jax.Array:
+    """Returns the covariance (6, 6) of a pose of which nothing is known."""
+    return _UNKNOWN_M**2 * jnp.eye(6, dtype=jnp.float32)

@@ -19,7 +19,9 @@ from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 _DEEPEST = 16  # an array has three axes or four
 _NESTED = list, tuple  # `list | tuple` would be made anew for each of the leaves of a map
 _MOST_WHOLE = 2**31 - 1  # a loop counts in int32
-_LEAST_VARIANCE = 1e-20  # of a pose, m^2 or rad^2; its square is a number of float32
+LEAST_VARIANCE = 1e-20
+"""Least variance of a pose, m^2 or rad^2; its square is a number of float32."""
+
 _ROUNDING = 1e-5  # of the eigenvalues of a correlation matrix (6, 6) in float32
 
 
@@ -284,7 +286,7 @@ def check_covariance(name: str, covariance: np.ndarray) -> None:
     expected = "expected a symmetric, positive definite matrix, m and rad"
     if not np.isfinite(exact).all():
         raise ValueError(f"{name} has values that are not finite, {expected}")
-    if np.diag(exact).min() < _LEAST_VARIANCE:
+    if np.diag(exact).min() < LEAST_VARIANCE:
         raise ValueError(f"{name} is not positive definite, {expected}")
     # In units of each component's own deviation: those of meters and radians differ.
     size = np.sqrt(np.diag(exact))

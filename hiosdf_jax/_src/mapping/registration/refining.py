@@ -38,6 +38,7 @@ from hiosdf_jax._src.mapping.registration.solving import (
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
 from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
+    LEAST_VARIANCE,
     as_array,
     as_number,
     as_traced,
@@ -56,7 +57,10 @@ from hiosdf_jax._src.state import Baked, Field
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384
 
-_LEAST_REACH_M = 1e-3
+_REACHES_M = 1e-3, 100.0  # least and most
+
+# Of a prior's correlations, in float32.
+_ASYMMETRY = 2e-3
 
 # Half a turn from the mean of a prior, the direction back to it is not defined.
 _MOST_TURN_RAD = 3.0
@@ -109,7 +113,7 @@ def refine_pose(
             not determine stay as in `pose`.
         noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m. By
             default it is `Config.range_noise` of the map; of a baked field, the default's.
-        reach_m: How far surfaces may be from where they should be, at least 0.001 m. The default
+        reach_m: How far surfaces may be from where they should be, 0.001 to 100 m. The default
             suits a map that is complete. In one that grows, a wrong surface may be nearer than one
             that is missing: `track` takes 0.2. With a smaller reach outliers also lose their weight
             sooner. Without a prior, a pose that ends farther from the given one, m or rad, has not
@@ -163,6 +167,9 @@ def _refine(
     starts: jax.Array | np.ndarray,
 ) -> Registration:
     cloud, pose = cloud.astype(jnp.float32), pose.astype(jnp.float32)
+    # Replaced where it is wrong: derivatives of what is not chosen must be finite, too.
+    valid = (reach_m >= _REACHES_M[0]) & (reach_m <= _REACHES_M[1])
+    reach_m = jnp.where(valid, reach_m, COMPLETE_REACH_M)
     points, some = draw_returns(cloud, least_range_of(field), _CANDIDATES)
     floor, growth = noise_of(field) if noise is None else noise
     range_noise = jnp.float32(floor), jnp.float32(growth)
@@ -172,6 +179,9 @@ def _refine(
     if prior is not None:
         mean, covariance = (jnp.asarray(part, jnp.float32) for part in prior)
         per_unit = 1 / units(rows)
+        proper = _is_covariance(covariance)
+        valid &= proper
+        covariance = jnp.where(proper, covariance, jnp.eye(6, dtype=jnp.float32))
         symmetric = (covariance + covariance.T) / 2  # of which the inverse reads one half
         anchor = Anchor(mean, per_unit[:, None] * invert(symmetric) * per_unit)
 
@@ -184,24 +194,39 @@ def _refine(
     covariance = covariance_of(residuals, directions, held, rows)
 
     verdict = judge(still, frozen, found)
-    usable = is_rigid(found) & jnp.all(jnp.isfinite(covariance))
+    usable = valid & is_rigid(found) & jnp.all(jnp.isfinite(covariance))
     if prior is None:
         # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
-        near = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
+        is_near = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
     else:
         usable &= is_rigid(prior[0])
-        near = way_and_angle(prior[0], found)[1] <= _MOST_TURN_RAD
+        is_near = way_and_angle(prior[0], found)[1] <= _MOST_TURN_RAD
+    converged = rests & verdict.fits & usable & is_near
     own = take_rows(rows, index)._replace(share=chosen.share)
     # What is not finite would make derivatives NaN, although no such pose is chosen.
     solution, other = (anchor, found, directions, inflation), _any_solution(prior is not None)
-    exact = differentiable(field, own, *jax.tree.map(partial(jnp.where, usable), solution, other))
+    chosen = jax.tree.map(partial(jnp.where, converged), solution, other)
+    exact = differentiable(field, own, *chosen)
+    constant = jax.lax.stop_gradient(jnp.where(usable, found, pose))
     return Registration(
-        pose=jnp.where(usable, exact, pose),
+        pose=jnp.where(converged, exact, constant),
         covariance=covariance,
         residual=verdict.residual,
         inliers=verdict.inliers,
-        converged=rests & verdict.fits & usable & near,
+        converged=converged,
     )
+
+
+def _is_covariance(matrix: jax.Array) -> jax.Array:
+    """Returns whether a matrix (6, 6) may be a covariance, () bool.
+
+    Less strict than `check_covariance`: of the eigenvalues, only pairs of axes are looked at.
+    """
+    variance = jnp.diag(matrix)
+    scale = jnp.sqrt(jnp.maximum(variance, LEAST_VARIANCE))
+    scaled = matrix / scale[:, None] / scale
+    symmetric = jnp.abs(scaled - scaled.T) <= _ASYMMETRY
+    return jnp.all(variance >= LEAST_VARIANCE) & jnp.all(symmetric & (jnp.abs(scaled) <= 1.001))
 
 
 def _any_solution(has_prior: bool) -> tuple[Anchor, jax.Array, Directions, jax.Array]:
@@ -217,7 +242,10 @@ _refine_jit = jax.jit(_refine)
 def checked_reach(reach_m: Any) -> Any:
     """Checks the argument `reach_m`, of tracers only the shape, and returns it as () float32."""
     if not is_traced(reach_m):
-        return np.asarray(as_number("reach_m", reach_m, _LEAST_REACH_M), np.float32)
+        reach_m = as_number("reach_m", reach_m, _REACHES_M[0])
+        if reach_m > _REACHES_M[1]:
+            raise ValueError(f"reach_m is {reach_m}, expected at most {_REACHES_M[1]:g}")
+        return np.asarray(reach_m, np.float32)
     if np.shape(reach_m) != ():
         raise ValueError(f"reach_m has shape {np.shape(reach_m)}, expected one number")
     return jnp.asarray(reach_m, jnp.float32)

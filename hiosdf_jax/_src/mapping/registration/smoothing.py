@@ -79,7 +79,14 @@ def smooth_poses(
     deviation = [as_number("motion_deviation", each, 0, above=True) for each in motion_deviation]
     if len(given) == 0:
         return np.zeros((0, 4, 4), np.float32)
-    return fit_chain(start, known, given, weights, np.repeat(deviation, 3)).astype(np.float32)
+    try:
+        result = fit_chain(start, known, given, weights, np.repeat(deviation, 3))
+    except ValueError as error:  # also numpy's LinAlgError
+        raise ValueError(
+            f"motion_deviation is {motion_deviation!r}, expected more beside such a covariance: "
+            "the normal equations are singular"
+        ) from error
+    return result.astype(np.float32)
 
 
 def _check_poses(name: str, poses: Any, count: int | None = None) -> np.ndarray:
@@ -100,7 +107,7 @@ def _check_registered(registered: Any | None, count: int) -> np.ndarray:
     if is_traced(registered):
         raise ValueError("registered is traced, expected concrete values, as outside jit")
     try:
-        mask = np.asarray(registered)
+        mask = np.ma.filled(np.ma.asanyarray(registered), False)
     except ValueError as error:  # rows of different lengths
         raise ValueError(f"registered is no array: {error}") from error
     if mask.shape != (count,) or mask.dtype != bool:
