@@ -11,6 +11,7 @@ import numpy as np
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
+from hiosdf_jax._src.mapping.registration.equations import UNKNOWN_M
 from hiosdf_jax._src.mapping.registration.motion import way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
@@ -28,8 +29,6 @@ MOST_MOVED = 2.0
 
 # The standard deviation of a prediction without a prior, as a share of `reach_m`, m and rad.
 _PREDICTED_DEVIATION = 0.25
-
-_UNKNOWN_M = 100.0  # standard deviation of a pose of which nothing is known, m and rad
 
 
 def track(
@@ -217,4 +216,4 @@ def _confirm_jit(
 
 def _unknown() -> jax.Array:
     """Returns the covariance (6, 6) of a pose of which nothing is known."""
-    return _UNKNOWN_M**2 * jnp.eye(6, dtype=jnp.float32)
+    return UNKNOWN_M**2 * jnp.eye(6, dtype=jnp.float32)

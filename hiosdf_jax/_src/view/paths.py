@@ -61,6 +61,7 @@ def save_paths(
         label="standard deviation in the map",
     )
     over_time.set(xlabel="frame", ylabel="cm", title="corrections")
+    over_time.xaxis.get_major_locator().set_params(integer=True)
     over_time.margins(y=0.25)  # room for the legend
     over_time.set_ylim(bottom=0)
     over_time.legend()

@@ -50,7 +50,7 @@ _FREE_BY_ONE_SIDE = 3
 
 # With a smaller share of the information of the best determined direction, a direction is free: it
 # is a rounding error.
-_LEAST_SHARE = 1e-6
+_LEAST_INFORMATION_SHARE = 1e-6
 
 LEAST_COMPARABLE = 0.1
 """Share of the returns that must lie where the map has observed."""
@@ -59,11 +59,11 @@ LEAST_COMPARABLE = 0.1
 # poses. Without it, clouds with 15 % of outliers are moved to where the map ends.
 _UNKNOWN_MORE = 0.1
 
-# Information of a free direction without a prior: a standard deviation of 100 m.
-_FREE_INFORMATION = 1e-4
+UNKNOWN_M = 100.0
+"""Standard deviation of what is not known of a pose, m and rad, as in a free direction."""
 
 # Cells of space, over which normals are averaged, m, and sums to which cells are spread.
-_CELL_M = 0.3
+_NORMALS_CELL_M = 0.3
 _CELLS = 4096
 
 
@@ -124,7 +124,7 @@ def find_directions(
     # Means over cells of space: they average the noise of normals.
     counts = (here.weight * here.sigma**2)[:, None]
     values = jnp.concatenate([counts, counts * here.jacobian], axis=-1)
-    total = sum_in_cells(values, here.points_world, _CELL_M)
+    total = sum_in_cells(values, here.points_world, _NORMALS_CELL_M)
     count = total[:, :1]
     mean = total[:, 1:] / jnp.maximum(count, 1e-9)
     information = jnp.matmul(mean.T, count * mean, precision="highest")
@@ -148,7 +148,7 @@ def find_directions(
     by_one = number < _FREE_BY_ONE_SIDE
     free = ~(jnp.where(by_one, jnp.min(grown, axis=0), jnp.max(grown, axis=0)) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
-    free |= told < _LEAST_SHARE * jnp.max(told)
+    free |= told < _LEAST_INFORMATION_SHARE * jnp.max(told)
     return Directions(basis, free | ~jnp.any(here.comparable))
 
 
@@ -291,5 +291,5 @@ def _pull(directions: Directions | None, anchor: Anchor) -> jax.Array | None:
     if directions is None:
         return anchor.information
     if anchor.information is None:
-        return jnp.where(directions.free, _FREE_INFORMATION, 0)[:, None] * directions.basis.T
+        return jnp.where(directions.free, UNKNOWN_M**-2, 0)[:, None] * directions.basis.T
     return product(directions.basis.T, anchor.information)

@@ -30,7 +30,7 @@ from hiosdf_jax._src.mapping.registration.matching import least_range_of, noise_
 from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly, draw_returns
-from hiosdf_jax._src.mapping.registration.solving import solve_coarse
+from hiosdf_jax._src.mapping.registration.solving import COMPLETE_REACH_M, solve_coarse
 from hiosdf_jax._src.numerics.intake import (
     as_array,
     as_key,
@@ -74,7 +74,6 @@ _COPIES = 16
 _KEPT = 256
 _KEPT_ROWS = 256
 _KEPT_AT_ONCE = 32
-_REACH_M = 0.7
 _PLACES = 4
 
 # Final scores: a return within this distance lies on a surface, m.
@@ -206,7 +205,7 @@ def _find_places(
 
     def improve(start: jax.Array) -> tuple[jax.Array, jax.Array]:
         still, frozen, begin = jax.lax.stop_gradient((field, fewer, start))
-        pose, share = solve_coarse(still, frozen, begin, Anchor(begin, None), _REACH_M)
+        pose, share = solve_coarse(still, frozen, begin, Anchor(begin, None), COMPLETE_REACH_M)
         pose = jnp.where(jnp.all(jnp.isfinite(pose)), pose, start)
         return pose, _score(field, rows._replace(share=share), pose)
 

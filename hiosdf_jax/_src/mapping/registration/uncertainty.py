@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.mapping.registration.comparing import Residuals, Rows, information_of, units
 from hiosdf_jax._src.mapping.registration.equations import (
+    UNKNOWN_M,
     Anchor,
     Directions,
     invert,
@@ -23,27 +24,25 @@ from hiosdf_jax._src.mapping.registration.equations import (
 )
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
-_CELL_M = 0.5
+_SPREAD_CELL_M = 0.5
 
 # Size of the cells that are left out in turn: a share of the typical range, and its limits, m.
 # Errors of a map reach about this far. For 200 poses in the simulated apartment the mean normalized
-# square is 6.2, and 6 is right. With 3,072 returns it was 5.5, with cells of 0.5 m 7.1, and with
-# cells of 1.2 m 5.4. Cells are spread to this many sums, or fewer if the rows are few. Those that
-# share one are left out at once.
+# square is 6.4, and 6 is right. With earlier code it was 6.2; with 3,072 returns 5.5, with cells of
+# 0.5 m 7.1, and with cells of 1.2 m 5.4. Cells are spread to this many sums, or fewer if the rows
+# are few. Those that share one are left out at once.
 _LEFT_OUT_SHARE = 0.4
 _LEFT_OUT_M = (0.2, 1.0)
 _LEFT_OUT_SUMS = 1024
 _LEAST_SUMS = 512
 _LEAST_LEFT = 1e-3  # share of a direction's information that always stays
 
-_FREE_M = 100.0  # standard deviation of a free direction without a prior
-
 
 def spread_of_slope(residuals: Residuals) -> jax.Array:
     """Measures the covariance of the slope, (6, 6) 1/m^2, from its parts in cells of space."""
     weighted = (residuals.weight * residuals.distance)[:, None] * residuals.jacobian
     values = jnp.concatenate([weighted, residuals.weight[:, None]], axis=-1)
-    total = sum_in_cells(values, residuals.points_world, _CELL_M)
+    total = sum_in_cells(values, residuals.points_world, _SPREAD_CELL_M)
     part, count = total[:, :6], jnp.sum(total[:, 6] > 0)
     # Six numbers were fitted to the sums.
     share = jnp.float32(count) / jnp.maximum(count - 6, 1).astype(jnp.float32)
@@ -75,7 +74,7 @@ def covariance_of(
     free = jnp.diag(directions.free.astype(jnp.float32))
     independent = invert(turn(information_of(residuals), directions) + free) - free
     # At least that of independent returns: a few cells may agree by chance.
-    own = _jackknife(residuals, directions, rows) + independent + _FREE_M**2 * free
+    own = _jackknife(residuals, directions, rows) + independent + UNKNOWN_M**2 * free
     if anchor.information is not None:
         prior = directions.basis.T @ anchor.information @ directions.basis
         own = invert(invert(own) + prior)
