@@ -108,10 +108,9 @@ class Tracker:
         predicted = self.predict(given)
         prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
         found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
-        near = (
-            max(way_and_angle(found.pose, jnp.asarray(predicted))) <= MOST_MOVED * GROWING_REACH_M
-        )
-        return self._add(frame, given, predicted, found._replace(converged=found.converged & near))
+        moved = max(way_and_angle(found.pose, jnp.asarray(predicted)))
+        near = found.converged & (moved <= MOST_MOVED * GROWING_REACH_M)
+        return self._add(frame, given, predicted, found._replace(converged=near))
 
     def counts(self) -> dict[str, int | None]:
         """How the frames fit the map, by the keys of `metrics.json`.

@@ -205,8 +205,8 @@ def _refine(
     own = take_rows(rows, index)._replace(share=chosen.share)
     # What is not finite would make derivatives NaN, although no such pose is chosen.
     solution, other = (anchor, found, directions, inflation), _any_solution(prior is not None)
-    chosen = jax.tree.map(partial(jnp.where, converged), solution, other)
-    exact = differentiable(field, own, *chosen)
+    finite = jax.tree.map(partial(jnp.where, converged), solution, other)
+    exact = differentiable(field, own, *finite)
     constant = jax.lax.stop_gradient(jnp.where(usable, found, pose))
     return Registration(
         pose=jnp.where(converged, exact, constant),
