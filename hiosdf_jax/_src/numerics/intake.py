@@ -19,10 +19,10 @@ from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
 _DEEPEST = 16  # an array has three axes or four
 _NESTED = list, tuple  # `list | tuple` would be made anew for each of the leaves of a map
 _MOST_WHOLE = 2**31 - 1  # a loop counts in int32
-LEAST_VARIANCE = 1e-20
-"""Least variance of a pose, m^2 or rad^2; its square is a number of float32."""
-
+_LEAST_VARIANCE = 1e-20  # of a pose, m^2 or rad^2; its square is a number of float32
 _ROUNDING = 1e-5  # of the eigenvalues of a correlation matrix (6, 6) in float32
+_ASYMMETRY = 2e-3  # of such a matrix inside jit
+_MOST_CORRELATION = 1.001
 
 
 def as_real(name: str, values: Any) -> np.ndarray:
@@ -286,7 +286,7 @@ def check_covariance(name: str, covariance: np.ndarray) -> None:
     expected = "expected a symmetric, positive definite matrix, m and rad"
     if not np.isfinite(exact).all():
         raise ValueError(f"{name} has values that are not finite, {expected}")
-    if np.diag(exact).min() < LEAST_VARIANCE:
+    if np.diag(exact).min() < _LEAST_VARIANCE:
         raise ValueError(f"{name} is not positive definite, {expected}")
     # In units of each component's own deviation: those of meters and radians differ.
     size = np.sqrt(np.diag(exact))
@@ -295,6 +295,19 @@ def check_covariance(name: str, covariance: np.ndarray) -> None:
         raise ValueError(f"{name} is not symmetric, {expected}")
     if np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] < -_ROUNDING:
         raise ValueError(f"{name} is not positive definite, {expected}")
+
+
+def may_be_covariance(matrix: jax.Array) -> jax.Array:
+    """Returns whether a matrix (6, 6) may be a covariance, () bool, also inside jit.
+
+    Less strict than `check_covariance`: of the eigenvalues, only pairs of axes are looked at.
+    """
+    variance = jnp.diag(matrix)
+    scale = jnp.sqrt(jnp.maximum(variance, _LEAST_VARIANCE))
+    scaled = matrix / scale[:, None] / scale
+    symmetric = jnp.abs(scaled - scaled.T) <= _ASYMMETRY
+    correlated = jnp.abs(scaled) <= _MOST_CORRELATION
+    return jnp.all(variance >= _LEAST_VARIANCE) & jnp.all(symmetric & correlated)
 
 
 def is_traced(*values: Any) -> bool:

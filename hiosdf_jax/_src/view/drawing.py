@@ -11,7 +11,7 @@ import numpy as np
 from hiosdf_jax._src.field import mesh
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.view.leveling import world_from_level
+from hiosdf_jax._src.view.leveling import is_tilted, world_from_level
 from hiosdf_jax._src.view.shading import save_shaded
 from hiosdf_jax._src.view.slices import save_slices
 
@@ -102,7 +102,7 @@ def _draw_slices(
     rotation = world_from_level(up_world)
     path = path_world @ rotation
     solid = np.asarray(surface.vertices if len(surface.faces) else bounds) @ rotation
-    if not np.array_equal(rotation, np.eye(3)):
+    if is_tilted(up_world):
         print("the world's z does not point up: slices.png is drawn in a leveled frame")
         corners = np.concatenate([solid, path])
         bounds = np.stack([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]).tolist()

@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.view.leveling import world_from_level
+from hiosdf_jax._src.view.leveling import is_tilted, world_from_level
 
 _MOST_SPREAD_CM = 1000.0  # larger ones are of directions of which nothing is known
 
@@ -36,7 +36,7 @@ def save_paths(
     from matplotlib.figure import Figure  # not pyplot: draws with Agg
 
     rotation = world_from_level(up_world)
-    frame_name = "world" if np.array_equal(rotation, np.eye(3)) else "leveled"
+    frame_name = "leveled" if is_tilted(up_world) else "world"
     given, refined = ((places @ rotation)[:, :2] for places in (given_world, refined_world))
     way_cm = 100 * np.linalg.norm(refined_world - given_world, axis=-1)
     frame = np.arange(len(refined))

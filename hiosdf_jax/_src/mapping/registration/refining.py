@@ -38,7 +38,6 @@ from hiosdf_jax._src.mapping.registration.solving import (
 from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
 from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
-    LEAST_VARIANCE,
     as_array,
     as_number,
     as_traced,
@@ -48,6 +47,7 @@ from hiosdf_jax._src.numerics.intake import (
     checked_cloud,
     cloud_and_returns,
     is_traced,
+    may_be_covariance,
 )
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.rigid import is_rigid
@@ -58,9 +58,6 @@ from hiosdf_jax._src.state import Baked, Field
 _CANDIDATES = 16384
 
 _REACHES_M = 1e-3, 100.0  # least and most
-
-# Of a prior's correlations, in float32.
-_ASYMMETRY = 2e-3
 
 # Half a turn from the mean of a prior, the direction back to it is not defined.
 _MOST_TURN_RAD = 3.0
@@ -179,7 +176,7 @@ def _refine(
     if prior is not None:
         mean, covariance = (jnp.asarray(part, jnp.float32) for part in prior)
         per_unit = 1 / units(rows)
-        proper = _is_covariance(covariance)
+        proper = may_be_covariance(covariance)
         valid &= proper
         covariance = jnp.where(proper, covariance, jnp.eye(6, dtype=jnp.float32))
         symmetric = (covariance + covariance.T) / 2  # of which the inverse reads one half
@@ -215,18 +212,6 @@ def _refine(
         inliers=verdict.inliers,
         converged=converged,
     )
-
-
-def _is_covariance(matrix: jax.Array) -> jax.Array:
-    """Returns whether a matrix (6, 6) may be a covariance, () bool.
-
-    Less strict than `check_covariance`: of the eigenvalues, only pairs of axes are looked at.
-    """
-    variance = jnp.diag(matrix)
-    scale = jnp.sqrt(jnp.maximum(variance, LEAST_VARIANCE))
-    scaled = matrix / scale[:, None] / scale
-    symmetric = jnp.abs(scaled - scaled.T) <= _ASYMMETRY
-    return jnp.all(variance >= LEAST_VARIANCE) & jnp.all(symmetric & (jnp.abs(scaled) <= 1.001))
 
 
 def _any_solution(has_prior: bool) -> tuple[Anchor, jax.Array, Directions, jax.Array]:
