@@ -7,13 +7,13 @@ import numpy as np
 from voxels import CONFIG
 
 from hiosdf_jax._src.grid.rays import place_cloud
-from hiosdf_jax._src.numerics.rigid import is_rigid
+from hiosdf_jax._src.numerics.rigid import is_rigid_on_host
 
 
 def test_ranges_are_measured_after_a_pose_with_rounding_errors():
     pose = np.eye(4, dtype=np.float32)
     pose[:3, :3] *= 1.002
-    assert is_rigid(pose, np)
+    assert is_rigid_on_host(pose)
     cloud = np.array([[0, 0, 0.9991], [0, 0.9, 0], [0.999, 0, 0], [5, 0, 0]], np.float32)
     config = dataclasses.replace(CONFIG, max_range=1.0)
     rays = place_cloud(config, jnp.asarray(cloud), np.ones(4, bool), jnp.asarray(pose))

@@ -8,7 +8,9 @@ from hiosdf_jax._src.mapping.registration.selection import (
     are_returns,
     draw_evenly,
     draw_informative,
+    pad_to_few_sizes,
     square_ranges_on_host,
+    take_evenly_on_device,
     take_evenly_on_host,
 )
 
@@ -77,6 +79,29 @@ def test_the_host_draws_the_rows_that_the_device_draws(count, finite):
     drawn = np.asarray(expected)[np.asarray(is_row)]
     np.testing.assert_array_equal(found[: len(drawn)], drawn)
     assert np.isnan(found[len(drawn) :]).all()
+
+
+@pytest.mark.parametrize("finite", [0.0, 0.1, 0.7, 1.0])
+def test_a_padded_cloud_gives_the_same_candidates_on_a_device(finite):
+    rng = np.random.default_rng(2)
+    cloud = rng.normal(size=(777, 3)).astype(np.float32)
+    cloud[rng.uniform(size=777) >= finite] = np.nan
+    cloud[::50] = 0.01  # too near
+    some = are_returns(square_ranges_on_host(cloud), 0.1)
+    expected = take_evenly_on_host(cloud, some, 128)
+    np.testing.assert_array_equal(
+        take_evenly_on_device(pad_to_few_sizes(cloud), 0.1, 128), expected
+    )
+
+
+@pytest.mark.parametrize("rows, padded", [(1, 1), (7, 7), (777, 832), (76_800, 81_920)])
+def test_padded_clouds_have_few_sizes(rows, padded):
+    cloud = np.ones((rows, 3), np.float32)
+    found = pad_to_few_sizes(cloud)
+    assert len(found) == padded
+    assert (found[:rows] == 1).all()
+    assert np.isnan(found[rows:]).all()
+    assert len({len(pad_to_few_sizes(np.ones((n, 3), np.float32))) for n in range(513, 1025)}) == 8
 
 
 @pytest.mark.parametrize("least_range_m", [0.0, 0.1])

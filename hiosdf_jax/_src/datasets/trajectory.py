@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hiosdf_jax._src.numerics.intake import as_real
-from hiosdf_jax._src.numerics.rigid import is_rigid
+from hiosdf_jax._src.numerics.rigid import is_rigid_on_host
 from hiosdf_jax._src.output_files import replacing
 
 
@@ -34,7 +34,7 @@ def write_tum(path: str | os.PathLike[str], stamps: Any, poses: Any) -> None:
         )
     if not np.isfinite(stamps).all() or not (np.diff(stamps) > 0).all():
         raise ValueError("stamps is not finite and increasing, expected seconds that increase")
-    wrong = [i for i, pose in enumerate(poses) if not is_rigid(pose, np)]
+    wrong = [i for i, pose in enumerate(poses) if not is_rigid_on_host(pose)]
     if wrong:
         raise ValueError(f"poses[{wrong[0]}] is not rigid, expected a rotation and a translation")
     from scipy.spatial.transform import Rotation

@@ -14,7 +14,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid
+from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid_on_host
 
 _DEEPEST = 16  # an array has three axes or four
 _NESTED = list, tuple  # `list | tuple` would be made anew for each of the leaves of a map
@@ -23,6 +23,7 @@ _LEAST_VARIANCE = 1e-20  # of a pose, m^2 or rad^2; its square is a number of fl
 _ROUNDING = 1e-5  # of the eigenvalues of a correlation matrix (6, 6) in float32
 _ASYMMETRY = 2e-3  # of such a matrix inside jit
 _MOST_CORRELATION = 1.001
+_FIRST_ROWS = 256  # of a cloud, among which almost always is a return
 
 
 def as_real(name: str, values: Any) -> np.ndarray:
@@ -216,13 +217,27 @@ def cloud_and_returns(cloud: Any) -> tuple[np.ndarray, np.ndarray]:
         ValueError: The cloud is misshapen or has no return.
     """
     floats = checked_cloud(cloud)
-    x, y, z = floats.T  # one column at a time is many times faster than all(axis=1)
-    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    finite = _are_finite(floats)
     if not finite.any():
         raise ValueError(
             f"cloud has no finite row among its {len(finite)}, expected at least one return"
         )
     return floats, finite
+
+
+def check_has_return(cloud: np.ndarray) -> None:
+    """Checks that a cloud (N, 3) float32 has a return, without a look at all of its rows.
+
+    Raises:
+        ValueError: No row is finite.
+    """
+    if not _are_finite(cloud[:_FIRST_ROWS]).any():
+        cloud_and_returns(cloud)
+
+
+def _are_finite(cloud: np.ndarray) -> np.ndarray:
+    x, y, z = cloud.T  # one column at a time is many times faster than all(axis=1)
+    return np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
 
 
 def check_vectors(name: str, vectors: Any) -> None:
@@ -266,7 +281,7 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
             f"{prefix}pose has values that are not finite, expected T_world_sensor: "
             f"{_printed(matrix)}"
         )
-    if not is_rigid(matrix, np):
+    if not is_rigid_on_host(matrix):
         raise ValueError(f"{prefix}pose {_pose_fault(matrix)}: {_printed(matrix)}")
     return matrix
 
@@ -360,7 +375,7 @@ def _pose_fault(pose: np.ndarray) -> str:
     gram = rotation.T @ rotation
     lengths = np.sqrt(np.diag(gram))
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        hint = "; is it transposed?" if is_rigid(pose.T, np) else ""
+        hint = "; is it transposed?" if is_rigid_on_host(pose.T) else ""
         return f"is not rigid: its last row is {_printed(pose[3])}, expected [0, 0, 0, 1]{hint}"
     if np.abs(lengths**2 - 1).max() > TOLERANCE:
         length = f"{lengths[0]:.4g}" if np.ptp(lengths) <= TOLERANCE else _printed(lengths)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,6 +15,8 @@ from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
 # Share of the rows that are drawn evenly. The others are drawn by what they tell of the pose.
 _EVEN_SHARE = 0.2
+
+_SIZE_BITS = 4  # of the size of a padded cloud that may be set
 
 
 def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
@@ -85,6 +88,34 @@ def take_evenly_on_host(cloud: np.ndarray, some: np.ndarray, count: int) -> np.n
     np.take(cloud, rows, axis=0, out=result[: len(rows)], mode="clip")  # "raise" copies twice
     result[len(rows) :] = np.nan
     return result
+
+
+def pad_to_few_sizes(cloud: np.ndarray) -> np.ndarray:
+    """Adds rows of NaN to a cloud (N, 3), so that clouds of similar sizes share a compilation.
+
+    There are eight sizes from each power of two to the next.
+    """
+    unit = 1 << max(0, (len(cloud) - 1).bit_length() - _SIZE_BITS)
+    padded = np.empty((-(-len(cloud) // unit) * unit, 3), np.float32)
+    padded[: len(cloud)] = cloud
+    padded[len(cloud) :] = np.nan
+    return padded
+
+
+@partial(jax.jit, static_argnames="count")
+def take_evenly_on_device(cloud: jax.Array, least_range_m: Any, count: int) -> jax.Array:
+    """Selects the rows that `draw_returns` selects, as `take_evenly_on_host` returns them.
+
+    Args:
+        cloud: (N, 3) m, N at least `count`.
+        least_range_m: Nearer rows are no returns.
+        count: Most rows to select.
+
+    Returns:
+        (count, 3) m; NaN after the last return.
+    """
+    points, some = draw_returns(cloud, least_range_m, count)
+    return jnp.where(some[:, None], points, jnp.nan)
 
 
 def even_steps(total: jax.Array, count: int) -> jax.Array:
