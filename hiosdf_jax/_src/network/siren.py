@@ -54,7 +54,13 @@ def network_of(config: Config) -> Siren:
 
 def init_params(config: Config, key: jax.Array) -> Any:
     """Draws initial weights from U(-sqrt(6 / n) / omega_0, sqrt(6 / n) / omega_0)."""
-    return network_of(config).init(key, jnp.zeros((1, 3), jnp.float32))
+    return _init_params(network_of(config), key)
+
+
+# Compiled as a whole: flax evaluates the network as well, by some 50 programs of their own.
+@functools.partial(jax.jit, static_argnums=0)
+def _init_params(network: Siren, key: jax.Array) -> Any:
+    return network.init(key, jnp.zeros((1, 3), jnp.float32))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
