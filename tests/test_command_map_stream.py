@@ -93,7 +93,7 @@ def test_the_first_bad_frame_ends_the_run(tmp_path, capsys, monkeypatch):
     assert cli.main(arguments) == 2  # already while the bounds are found
     message = (
         f"hiosdf: frame 12: {stream}: poses[12]: pose has values that are not finite, "
-        "expected T_world_sensor: "
+        "expected a rigid transform: "
     )
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith(message)

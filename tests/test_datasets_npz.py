@@ -105,6 +105,9 @@ def test_a_stream_is_a_sequence(tmp_path):
     for index in (3, -4):
         with pytest.raises(IndexError, match=f"frame {index}, expected one of 3"):
             stream[index]
+    for index in (slice(1, 3), 1.5):
+        with pytest.raises(TypeError, match=r"frame .*, expected a whole number"):
+            stream[index]
     stream[0][1][:] = 7  # changing a returned pose does not change the stream
     np.testing.assert_array_equal(stream[0][1], POSES[0])
 
@@ -138,6 +141,8 @@ def test_a_bad_pose_is_a_bad_frame(tmp_path):
         (DEPTH, {"poses": np.array(["a"])}, "poses has type <U1, expected numbers"),
         (DEPTH, {"poses": np.array([None])}, "key 'poses': not a readable array"),
         (RANGE, {"directions": DIRECTIONS[0]}, r"directions has shape \(6, 3\), expected \(2, 6"),
+        (RANGE, {"directions": 1.05 * DIRECTIONS}, "directions have length 1.05, expected unit"),
+        (RANGE, {"directions": np.nan * DIRECTIONS}, "directions have no finite length"),
         (RANGE, {"range_scale": np.float32("nan")}, "range_scale = nan"),
         (RANGE, {"range": np.ones(3)}, r"range has shape \(3,\)"),
         (POINTS, {"offsets": None}, "key 'offsets' is missing"),

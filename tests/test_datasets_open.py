@@ -6,6 +6,13 @@ from recordings import FRAMES, INTRINSICS, write_scannet, write_tum
 from hiosdf_jax.datasets import open_stream
 
 
+def test_a_path_of_another_type_is_refused():
+    with pytest.raises(
+        ValueError, match="path is a NoneType, expected the name of a file or folder"
+    ):
+        open_stream(None)
+
+
 def test_unknown_and_ambiguous_layouts(tmp_path):
     with pytest.raises(FileNotFoundError):
         open_stream(tmp_path / "none")

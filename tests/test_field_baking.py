@@ -140,6 +140,8 @@ def test_bad_arguments_are_named(field, baked):
             hio.bake(field, **bad)
     with pytest.raises(ValueError, match="field is Baked, expected a MapState or a Field"):
         hio.bake(baked)
+    with pytest.raises(ValueError, match=r"of shapes \(.*\), \(2, 2, 2\), .*, expected equal ones"):
+        hio.sdf(baked.replace(frontier=np.zeros((2, 2, 2))), np.zeros(3))
     with pytest.raises(ValueError, match="expected a MapState, a Field or a Baked"):
         hio.sdf("map", np.zeros(3))
 

@@ -11,7 +11,7 @@ from room import BOUNDS, CONFIG, ask
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid import lookup
-from hiosdf_jax._src.state import surface_of
+from hiosdf_jax._src.state import FRONTIER_STEPS, surface_of
 
 network_sdf = jax.jit(blend.network_sdf)
 
@@ -197,7 +197,7 @@ def test_unseen_space_is_an_obstacle_on_request(room_map):
     far = np.clip((np.abs(grid) - 0.8) / 0.2, 0, 1)
     unseen = np.clip((-np.asarray(hio.query(room_map, inside).frontier) - 0.2) / 0.2, 0, 1)
     value = near + np.maximum(far, unseen) * (network - near)
-    value += np.linalg.norm(points - inside, axis=1)
+    value -= np.linalg.norm(points - inside, axis=1)
     expected = np.minimum(value, plain.frontier)
     # From 0 to 40 cm deep in unseen space the frontier takes over: its gradient leads out.
     frontier = np.asarray(plain.frontier, np.float64)
@@ -250,6 +250,40 @@ def test_the_lower_bound_of_unseen_space_is_at_most_the_frontier(room_map):
     blind = np.asarray(hio.query(trusting, points).lower)
     np.testing.assert_allclose(blind[unseen], frontier[unseen], atol=1e-6)
     assert (blind[~unseen] > frontier[~unseen]).all()
+
+
+def test_the_lower_bound_is_negative_outside_a_box_that_is_seen_up_to_its_faces(room_map):
+    derived = room_map.grid.derived
+    seen = jnp.full_like(derived.frontier_steps, FRONTIER_STEPS)
+    grid = room_map.grid.replace(derived=derived.replace(frontier_steps=seen))
+    state = room_map.replace(grid=grid, optimism=jnp.float32(-100))
+    points = np.random.default_rng(4).uniform(-1.6, 1.6, (2000, 3)).astype(np.float32)
+    beyond = np.linalg.norm(points - np.clip(points, *BOUNDS), axis=1)
+    for field in (state, hio.bake(state, 0.1)):
+        lower = np.asarray(hio.query(field, points).lower)
+        assert (lower[beyond > 0] <= -beyond[beyond > 0] + 1e-6).all()
+        assert (lower[beyond == 0] > 0).mean() > 0.5
+
+
+def test_the_lower_bound_of_a_baked_field_is_negative_where_it_has_seen_nothing(room_map):
+    trusting = room_map.replace(optimism=jnp.float32(-100))
+    points = np.random.default_rng(3).uniform(*BOUNDS, (2000, 3)).astype(np.float32)
+    answer = hio.query(hio.bake(trusting, 0.1), points)
+    unseen = ~np.asarray(answer.observed)
+    assert 0.1 < unseen.mean() < 0.99
+    assert (np.asarray(answer.lower)[unseen] <= answer.frontier[unseen] + 1e-6).all()
+    assert (np.asarray(answer.lower)[~unseen] > answer.frontier[~unseen]).all()
+
+
+def test_just_outside_the_box_an_obstacle_leads_back(room_map):
+    points = np.random.default_rng(5).uniform(-1.3, 1.3, (2000, 3)).astype(np.float32)
+    away = points - np.clip(points, *BOUNDS)
+    beyond = np.linalg.norm(away, axis=1)
+    near = (beyond > 0) & (beyond < 0.05)
+    assert near.sum() > 50
+    _, gradient = hio.sdf_and_grad(room_map, points, unknown="obstacle")
+    outward = np.sum(away * gradient, axis=1)[near] / beyond[near]
+    assert (outward < 0).mean() > 0.9
 
 
 def test_another_policy_is_refused_by_name(room_map):

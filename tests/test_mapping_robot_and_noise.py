@@ -158,7 +158,10 @@ def test_the_configurations_noise_is_the_default(empty_map):
         ({"robot": (CENTERS * np.nan, RADII)}, "robot centers has values"),
         ({"robot": (CENTERS, -RADII)}, "robot radii has values"),
         ({"robot": (CENTERS, 1000 * RADII)}, "from 50.0 to 60.0, expected meters, .* millimeters"),
+        ({"robot": (CENTERS, 0.1)}, r"robot has .* radii of shape \(\), expected \(K, 3\) and"),
         ({"noise": 0.01}, "noise is 0.01, expected two numbers"),
+        ({"noise": (5, 0.1)}, "noise a has values .* expected meters, at most 1; .* millimeters"),
+        ({"noise": (0.01, 2)}, "noise b has values .* expected 1/m, at most 1"),
         ({"noise": (0.0, 0.1)}, "noise a has values"),
         ({"noise": (1e-22, 0.0)}, "noise a has values"),
         ({"noise": (10**400, 0.0)}, "noise has dtype object"),
@@ -196,6 +199,7 @@ BAD_INSIDE_JIT = {
     "no noise": {"noise": np.zeros(2, np.float32)},
     "NaN noise": {"noise": np.full(2, np.nan, np.float32)},
     "tiny noise": {"noise": np.array([1e-22, 0], np.float32)},
+    "noise in millimeters": {"noise": np.array([5, 2], np.float32)},
 }
 
 

@@ -382,8 +382,15 @@ def check_map(state: Any, stacked: bool = False) -> None:
 
 
 def check_single(name: str, field: MapState | Field | Baked) -> None:
-    """Raises a ValueError if an argument is a stack of maps, outside `jax.vmap`."""
+    """Raises a ValueError if an argument is a stack of maps, or arrays that do not match."""
     _check_kept(name, field)
+    if isinstance(field, Baked):
+        shapes = [np.shape(each) for each in (field.sdf, field.frontier, field.lower)]
+        if len(set(shapes)) > 1:
+            raise ValueError(
+                f"{name} has sdf, frontier and lower of shapes {', '.join(map(str, shapes))}, "
+                "expected equal ones"
+            )
     voxels = _voxels(field)
     axes = np.ndim(voxels) - 3
     if axes:

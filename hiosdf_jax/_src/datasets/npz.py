@@ -31,6 +31,8 @@ from hiosdf_jax._src.numerics.intake import check_pose
 _depth_to_cloud = jax.jit(sensors.depth_to_cloud)
 _ranges_to_cloud = jax.jit(sensors.ranges_to_cloud)
 
+_LENGTH_TOLERANCE = 0.01  # of directions, which may be stored as float16
+
 _Shape = tuple[int | str, ...]  # a letter stands for any length
 
 _LAYOUTS = {  # the key that identifies a layout: the other keys that it needs
@@ -131,6 +133,11 @@ class NpzStream:
         self._expect("directions", (*ranges.shape[1:], 3))
         self._scale = self._positive("range_scale")
         directions = self._arrays["directions"].astype(np.float32)
+        lengths = np.linalg.norm(directions.reshape(-1, 3), axis=1)
+        wrong = lengths[np.abs(lengths - 1) > _LENGTH_TOLERANCE]  # without those that are NaN
+        if len(wrong) or not np.isfinite(lengths).any():
+            found = f"length {wrong[0]:.4g}" if len(wrong) else "no finite length"
+            raise ValueError(f"{self.path}: directions have {found}, expected unit vectors")
         self._to_cloud = partial(_ranges_to_cloud, directions=directions)
         self._check_size(math.prod(ranges.shape[1:]))
         return len(ranges)

@@ -103,6 +103,8 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
         ValueError: The format is unknown or ambiguous, has no such option, or a file is malformed.
         ModuleNotFoundError: The format needs a package that is not installed.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path is a {type(path).__name__}, expected the name of a file or folder")
     path = Path(path)
     path.stat()
     if format is None:

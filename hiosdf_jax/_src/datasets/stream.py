@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 import os
 import warnings
 from collections.abc import Callable
@@ -127,7 +128,10 @@ def frame_index(index: int, count: int, path: str | os.PathLike[str]) -> int:
 
     Raises:
         IndexError: Index is out of range. It also ends a plain `for cloud, pose in stream`.
+        TypeError: It is no whole number, such as a slice.
     """
+    if not isinstance(index, numbers.Integral):
+        raise TypeError(f"{path}: frame {index!r}, expected a whole number")
     if not -count <= index < count:
         raise IndexError(f"{path}: frame {index}, expected one of {count} frames")
     return index % count

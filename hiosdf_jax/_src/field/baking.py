@@ -39,8 +39,9 @@ def bake(
 
     Returns:
         The baked field. Its `frontier` is reduced by the largest interpolation error, so that no
-        unseen place looks observed. Its `lower` is not: with a resolution of 20 cm it exceeds the
-        true distance at thin things by up to 8 cm, with 5 cm by 1 cm.
+        unseen place looks observed, and `lower` is negative there. In observed space `lower` is not
+        reduced: with a resolution of 20 cm it exceeds the true distance at thin things by up to
+        8 cm, with 5 cm by 1 cm.
 
     Raises:
         ValueError: An argument has a wrong type, shape or value.

@@ -39,9 +39,10 @@ AnyField = MapState | Field | Baked
 def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array:
     """Computes the signed distance to the nearest surface.
 
-    Outside the bounds it is the distance to the box plus the value at the box's nearest point.
-    Outside a baked window, where a surface may be anywhere, the distance to it is subtracted
-    instead. NaN points return -1e30, i.e. in collision, so that a diverged rollout is never safe.
+    Outside the bounds it is the distance to the box plus the value at the box's nearest point. With
+    unknown="obstacle", and outside a baked window, where a surface may be anywhere, the distance to
+    the box is subtracted instead. NaN points return -1e30, i.e. in collision, so that a diverged
+    rollout is never safe.
 
     Args:
         field: A map, a snapshot of one, or a baked field.
@@ -216,11 +217,15 @@ def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bou
     place = _place(field, points)
     answers = _answers_of(field)
     if bound == "lower":
-        value = answers.lower(field, place.nearest) - place.beyond
+        value = answers.lower(field, place.nearest)
+        # Space outside the bounds is unseen.
+        value = jnp.where(place.beyond > 0, jnp.minimum(value, 0), value) - place.beyond
     else:
         value = answers.sdf(field, place.nearest, unknown)
-        # Outside a window the map may have a surface that the window does not know.
-        nearer = jnp.any(jnp.isnan(points), axis=-1) | (isinstance(field, Baked) and field.window)
+        # Outside a window the map may have a surface that the window does not know. Outside the
+        # bounds an obstacle's gradient must lead back to them.
+        is_window = isinstance(field, Baked) and field.window
+        nearer = jnp.any(jnp.isnan(points), axis=-1) | is_window | (unknown == "obstacle")
         value = value + jnp.where(nearer, -place.beyond, place.beyond)
     if unknown == "network":
         return value

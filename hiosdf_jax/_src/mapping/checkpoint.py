@@ -195,7 +195,7 @@ def _read_header(archive: Archive) -> tuple[int, Config, str]:
             raise ValueError(f"its header has the key {key_impl!r} and the config {fields!r}")
     if type(version) is not int or version not in range(2, _VERSION + 1):
         raise ValueError(
-            f"{path} has format version {version}, expected 2 to {_VERSION}; a map of another "
+            f"{path} has format version {version!r}, expected 2 to {_VERSION}; a map of another "
             "version must be made again from its recording"
         )
     fields = dict(fields)

@@ -278,7 +278,7 @@ def check_pose(pose: Any, source: str = "") -> np.ndarray:
     _check_pose_shape(matrix, prefix)
     if not np.isfinite(matrix).all():
         raise ValueError(
-            f"{prefix}pose has values that are not finite, expected T_world_sensor: "
+            f"{prefix}pose has values that are not finite, expected a rigid transform: "
             f"{_printed(matrix)}"
         )
     if not is_rigid_on_host(matrix):

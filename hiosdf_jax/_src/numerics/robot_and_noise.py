@@ -13,6 +13,9 @@ from hiosdf_jax._src.numerics.intake import as_array, is_traced
 LEAST_NOISE_M = 1e-4
 """Smaller noise would give a return a weight that float16 cannot hold."""
 
+LARGEST_NOISE = 1.0
+"""Larger noise, m and 1/m, is that of a sensor in millimeters, or no sensor's."""
+
 LARGEST_RADIUS_M = 5.0
 """Larger spheres of a robot are in millimeters, or a mistake that would empty the map."""
 
@@ -36,7 +39,7 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
         except (TypeError, ValueError):
             raise ValueError(f"robot is {robot!r}, expected (centers, radii)") from None
         centers, radii = as_array("robot centers", centers), as_array("robot radii", radii)
-        if centers.ndim != 2 or (centers.shape, radii.shape) != ((len(radii), 3), (len(radii),)):
+        if radii.ndim != 1 or centers.shape != (len(radii), 3):
             raise ValueError(
                 f"robot has centers of shape {centers.shape} and radii of shape {radii.shape}, "
                 "expected (K, 3) and (K,)"
@@ -51,8 +54,8 @@ def check_extras(robot: Any, noise: Any) -> tuple[Any, Any]:
         noise = as_array("noise", given)
         if noise.shape != (2,):
             raise ValueError(f"noise is {given!r}, expected two numbers (a, b)")
-        _check_values("noise a", noise[0], LEAST_NOISE_M)
-        _check_values("noise b", noise[1], 0)
+        _check_values("noise a", noise[0], LEAST_NOISE_M, LARGEST_NOISE)
+        _check_values("noise b", noise[1], 0, LARGEST_NOISE, "1/m")
         noise = jnp.asarray(noise)
     return robot, noise
 
@@ -68,11 +71,13 @@ def extras_are_valid(
         valid &= ((radii >= 0) & (radii <= LARGEST_RADIUS_M)).all()  # False for NaN
     if noise is not None:
         least = jnp.asarray([LEAST_NOISE_M, 0.0], jnp.float32)
-        valid &= (jnp.isfinite(noise) & (noise >= least)).all()
+        valid &= ((noise >= least) & (noise <= LARGEST_NOISE)).all()  # False for NaN
     return valid
 
 
-def _check_values(name: str, values: Any, least: float, most_m: float = np.inf) -> None:
+def _check_values(
+    name: str, values: Any, least: float, most: float = np.inf, unit: str = "meters"
+) -> None:
     if is_traced(values):
         return
     array = np.asarray(values)
@@ -80,5 +85,5 @@ def _check_values(name: str, values: Any, least: float, most_m: float = np.inf) 
     if not (np.isfinite(array).all() and (array >= np.float32(least)).all()):
         expected = "finite values" if least == -np.inf else f"finite values >= {least:.3g}"
         raise ValueError(f"{came} {expected}")
-    if (array > most_m).any():
-        raise ValueError(f"{came} meters, at most {most_m:g}; are they in millimeters?")
+    if (array > most).any():
+        raise ValueError(f"{came} {unit}, at most {most:g}; are they in millimeters?")

@@ -126,7 +126,8 @@ def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapS
     """
     if not isinstance(submaps, list | tuple) or not submaps:
         raise ValueError(
-            f"submaps is {type(submaps).__name__}, expected a list of maps, at least 1"
+            f"submaps is {'empty' if submaps in ([], ()) else type(submaps).__name__}, expected a "
+            "list of maps, at least 1"
         )
     for i, submap in enumerate(submaps):
         _check_map(f"submaps[{i}]", submap)
