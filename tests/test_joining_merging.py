@@ -185,7 +185,7 @@ def test_what_does_not_fit_is_refused(room_map):
         hio.correct([room_map, deep], [EYE, EYE])
     with pytest.raises(ValueError, match="b is Field, expected a MapState"):
         hio.merge(room_map, hio.snapshot(room_map), EYE)
-    with pytest.raises(ValueError, match="submaps is list, expected a list of maps, at least 1"):
+    with pytest.raises(ValueError, match="submaps is empty, expected a list of maps, at least 1"):
         hio.correct([], np.zeros((0, 4, 4)))
     with pytest.raises(ValueError, match=r"poses has shape \(2, 4, 4\), expected \(1, 4, 4\)"):
         hio.correct([room_map], [EYE, EYE])
