@@ -83,10 +83,9 @@ def frontier(field: Field, points_world: jax.Array) -> jax.Array:
 
 
 def lower(field: Field, points_world: jax.Array) -> jax.Array:
-    """Computes a lower bound of the true distance.
+    """Computes a lower bound of the true distance in observed space.
 
-    The bound is cautious - optimism * scale. `mapping.calibration` measures the optimism. In unseen
-    space, which may be solid, the bound is at most the distance to the frontier, which is negative.
+    The bound is cautious - optimism * scale. `mapping.calibration` measures the optimism.
 
     Args:
         field: The field.
@@ -101,8 +100,7 @@ def lower(field: Field, points_world: jax.Array) -> jax.Array:
     # this.
     beside = jnp.clip(_BESIDE_VOXELS - unseen / field.config.voxel_size, 0, 1)
     nearer = _HIDDEN_BESIDE_VOXELS * field.config.voxel_size * beside
-    bound = _expect_hidden(cautious, unseen, nearer) - field.optimism * scale
-    return jnp.where(unseen < 0, jnp.minimum(bound, unseen), bound)
+    return _expect_hidden(cautious, unseen, nearer) - field.optimism * scale
 
 
 def network_sdf(field: Field, points_world: jax.Array) -> jax.Array:

@@ -38,12 +38,8 @@ def frontier(baked: Baked, points_world: jax.Array) -> jax.Array:
 
 
 def lower(baked: Baked, points_world: jax.Array) -> jax.Array:
-    """Interpolates the lower bound of the distance at points (..., 3) m inside the box; (...) m.
-
-    In unseen space it is at most the distance to the frontier, as that of a live map.
-    """
-    bound, unseen = interpolate(baked, baked.lower, points_world), frontier(baked, points_world)
-    return jnp.where(unseen < 0, jnp.minimum(bound, unseen), bound)
+    """Interpolates the lower bound of the distance at points (..., 3) m inside the box; (...) m."""
+    return interpolate(baked, baked.lower, points_world)
 
 
 def sample_counts(size: Any, resolution: float) -> tuple[int, int, int]:

@@ -216,10 +216,10 @@ def _with_gradient(
 def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound) -> jax.Array:
     place = _place(field, points)
     answers = _answers_of(field)
+    frontier = _frontier(field, place)
     if bound == "lower":
-        value = answers.lower(field, place.nearest)
-        # Space outside the bounds is unseen.
-        value = jnp.where(place.beyond > 0, jnp.minimum(value, 0), value) - place.beyond
+        value = answers.lower(field, place.nearest) - place.beyond
+        value = jnp.where(frontier < 0, jnp.minimum(value, frontier), value)
     else:
         value = answers.sdf(field, place.nearest, unknown)
         # Outside a window the map may have a surface that the window does not know. Outside the
@@ -229,7 +229,6 @@ def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bou
         value = value + jnp.where(nearer, -place.beyond, place.beyond)
     if unknown == "network":
         return value
-    frontier = _frontier(field, place)
     solid = jnp.minimum(value, frontier)
     # Deep in unseen space the frontier answers alone: its gradient leads out, that of a guess
     # about what stands there need not.

@@ -23,7 +23,7 @@ _LEAST_VARIANCE = 1e-20  # of a pose, m^2 or rad^2; its square is a number of fl
 _ROUNDING = 1e-5  # of the eigenvalues of a correlation matrix (6, 6) in float32
 _ASYMMETRY = 2e-3  # of such a matrix inside jit
 _MOST_CORRELATION = 1.001
-_FIRST_ROWS = 256  # of a cloud, among which almost always is a return
+_FIRST_ROWS = 256  # almost always, one of these rows of a cloud is a return
 
 
 def as_real(name: str, values: Any) -> np.ndarray:

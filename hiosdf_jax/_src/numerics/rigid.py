@@ -14,7 +14,6 @@ FARTHEST_M = 1e5
 TOLERANCE = 5e-3
 """Largest deviation of R^T R from the identity; real trajectories have few digits."""
 
-
 _ROUNDING = 1e-6  # of the last row
 
 

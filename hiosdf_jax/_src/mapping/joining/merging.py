@@ -124,11 +124,10 @@ def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapS
     Example:
         >>> state = hio.correct(submaps, poses_after_the_loop, bounds)
     """
-    if not isinstance(submaps, list | tuple) or not submaps:
-        raise ValueError(
-            f"submaps is {'empty' if submaps in ([], ()) else type(submaps).__name__}, expected a "
-            "list of maps, at least 1"
-        )
+    is_list = isinstance(submaps, list | tuple)
+    if not (is_list and submaps):
+        found = "empty" if is_list else type(submaps).__name__
+        raise ValueError(f"submaps is {found}, expected a list of maps, at least 1")
     for i, submap in enumerate(submaps):
         _check_map(f"submaps[{i}]", submap)
         _check_fits("submaps[0]", submaps[0], f"submaps[{i}]", submap)
