@@ -60,7 +60,7 @@ poses_world_sensor = np.load(folder / "poses.npy")
 
 def read(index):
     with Image.open(folder / f"{index:03}.png") as image:
-        depth = np.asarray(image) / 1000.0  # m; 0 is no return
+        depth = np.asarray(image) / 1000.0  # m; 0 is not a return
     cloud = np.asarray(datasets.depth_to_cloud(depth, intrinsics))
     return cloud, poses_world_sensor[index]
 

@@ -81,7 +81,7 @@ def distances(field, points):
 
 
 def arrays_equal(a, b):
-    """Whether all arrays of two maps or parts of maps are equal, bit by bit."""
+    """Whether all arrays of two maps or parts of maps are equal, bit for bit."""
 
     def plain(tree):
         return [

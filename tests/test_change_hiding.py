@@ -48,7 +48,7 @@ ROWS = 16_000
 
 
 def rays_of(points):
-    """Rays to points; the other rows are no returns. One shape: one compilation for all tests."""
+    """Rays to points; the other rows are not returns. One shape: one compilation for all tests."""
     real = np.arange(ROWS) < len(points)
     rays = rays_to(np.resize(points, (ROWS, 3)).astype(np.float32), SENSOR, hit=real)
     return rays._replace(in_range=jnp.asarray(real))

@@ -49,7 +49,7 @@ def through(offsets):
 
 
 def rays_of(ends):
-    """Rays to up to 600 ends; other rows are no returns."""
+    """Rays to up to 600 ends; other rows are not returns."""
     real = np.arange(600) < len(ends)
     rays = rays_to(np.resize(ends, (600, 3)).astype(np.float32), SENSOR, hit=real)
     return rays._replace(in_range=jnp.asarray(real))

@@ -94,10 +94,10 @@ def case(tmp_path, kind):
         save = out / "metrics.json"
         arguments = [*map_, "--output", str(out), "--save", str(save)]
         return arguments, f"--save {save} would replace {save}"
-    if kind == "save onto a file that is no map":
+    if kind == "save onto a file that is not a map":
         save = tmp_path / "poses.txt"
         save.write_text("0 0 0 0 0 0 0 1")
-        return [*map_, "--save", str(save)], f"--save {save} would replace a file that is no map"
+        return [*map_, "--save", str(save)], f"--save {save} would replace a file that is not a map"
     if kind == "save below a file":
         return [*map_, "--save", f"{stream}/map.npz"], f"{stream}/map.npz: Not a directory"
     if kind == "save onto a long name":
@@ -150,7 +150,7 @@ def case(tmp_path, kind):
         "output into a long name",
         "save onto the stream",
         "save onto a result",
-        "save onto a file that is no map",
+        "save onto a file that is not a map",
         "save below a file",
         "output is a file",
         "output below a file",

@@ -118,7 +118,7 @@ def on_a_sphere(radius):
 
 
 def padded(cloud):
-    """With many rows that are no returns, and some beyond all ranges."""
+    """With many rows that are not returns, and some beyond all ranges."""
     rows = np.full((20_000, 3), np.nan, np.float32)
     rows[: len(cloud)] = cloud
     rows[-3:] = [[np.inf, 0, 0], [3e38, 3e38, 3e38], [-np.inf, np.inf, 1]]

@@ -100,7 +100,7 @@ BAD = {
     "complex cloud": (np.ones((2, 3), complex), np.eye(4), "cloud has dtype complex128, expected"),
     "words": ([["a", "b", "c"]], np.eye(4), "cloud has dtype <U1, expected real numbers"),
     "huge numbers": ([[10**400, 0, 0]], np.eye(4), "cloud has dtype object, expected real"),
-    "ragged cloud": ([[1, 2, 3], [4, 5]], np.eye(4), "cloud is no array"),
+    "ragged cloud": ([[1, 2, 3], [4, 5]], np.eye(4), "cloud is not an array"),
     "no pose": (np.ones((2, 3)), None, "pose has dtype object, expected real numbers"),
     "small pose": (np.ones((2, 3)), np.eye(3), r"pose has shape \(3, 3\), expected \(4, 4\)"),
 }

@@ -73,7 +73,7 @@ def test_update_runs_each_stage_in_a_scope_of_its_name(program):
 
 
 def test_update_is_the_stages_one_by_one(program, empty_map, frame):
-    """Both are the same program, so their maps are equal bit by bit."""
+    """Both are the same program, so their maps are equal bit for bit."""
 
     def fused(_, step):
         for stage in FUSION:

@@ -239,7 +239,7 @@ def call_image(state, draw):
     else:
         rays = draw(argument(np.ones(5))), draw(argument(np.tile([1.0, 0, 0], (5, 1))))
         cloud = datasets.ranges_to_cloud(*rays)
-    return None if cloud is not None else cloud  # rows that are no returns are NaN
+    return None if cloud is not None else cloud  # rows that are not returns are NaN
 
 
 def _fields(state):

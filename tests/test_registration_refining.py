@@ -494,7 +494,7 @@ UNIT = np.eye(6)
         ({"pose": BAD}, "^pose "),
         ({"prior": np.eye(4)}, "prior is "),
         ({"prior": (np.eye(4), np.eye(5))}, "prior has a mean of shape"),
-        ({"prior": (np.eye(4), [[1], [2, 3]])}, "prior covariance is no array of numbers"),
+        ({"prior": (np.eye(4), [[1], [2, 3]])}, "prior covariance is not an array of numbers"),
         ({"prior": (np.eye(4), UNIT - 2 * np.eye(6, k=1) - 2 * np.eye(6, k=-1))}, "not positive"),
         ({"prior": (np.eye(4), np.diag([1, 1, 1, 1, 1, 0]))}, "not positive definite"),
         ({"reach_m": 1e-30}, "reach_m is 1e-30, expected >= 0.001"),

@@ -214,7 +214,7 @@ def test_no_poses_and_one_pose():
         ({"motion_deviation": 0.1}, r"motion_deviation is 0.1, expected \(m, rad\)"),
         ({"motion_deviation": (0.1,)}, r"motion_deviation is \(0.1,\), expected \(m, rad\)"),
         ({"motion_deviation": (1e-300, 1e-300)}, r"motion_deviation is \(1e-300, 1e-300\)"),
-        ({"registered": [[True], []]}, "registered is no array"),
+        ({"registered": [[True], []]}, "registered is not an array"),
         ({"registered": [True]}, r"registered is bool \(1,\), expected bool \(3,\)"),
         ({"registered": [1, 0, 1]}, r"registered is int64 \(3,\), expected bool"),
     ],

@@ -1,7 +1,7 @@
 """Files that are written whole or not at all.
 
-A file is written aside in its own folder, under a name that ends in `.part`, and moved into place
-once the disk has all of it. A crash, a kill or a full disk therefore leaves the old file. The
+A file is written to a temporary file in its own folder, whose name ends in `.part`, and moved into
+place once the disk has all of it. A crash, a kill or a full disk therefore leaves the old file. The
 writer holds a lock on its `.part` file, and the kernel drops the lock when the writer dies: the
 next writer of the same file removes every `.part` file of it that nobody holds.
 """
@@ -32,8 +32,8 @@ _TOGETHER = "results"  # files that replace others together lie in results.<32 d
 def replacing(path: _Path) -> Iterator[BinaryIO]:
     """Opens a file that takes the place of another one when the block ends without an error.
 
-    The rights and the owner of an existing file are kept. A link stays, and the file that it leads
-    to is replaced.
+    The permissions and the owner of an existing file are kept. A link stays, and the file that it
+    leads to is replaced.
 
     Example:
         with replacing("metrics.json") as file:
@@ -54,7 +54,7 @@ def replacing(path: _Path) -> Iterator[BinaryIO]:
         aside, file = _open_aside(target)
     try:
         with _naming(path), file:
-            _copy_rights(target, file.fileno())
+            _copy_permissions(target, file.fileno())
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -93,7 +93,7 @@ def replacing_together(folder: _Path, names: Sequence[str]) -> Iterator[Path]:
         targets = {name: _target(folder / name) for name in names}
         for name, target in targets.items():
             if (aside / name).exists():
-                _copy_rights(target, aside / name)
+                _copy_permissions(target, aside / name)
             else:
                 (folder / name).unlink(missing_ok=True)
         for name, target in targets.items():
@@ -169,7 +169,7 @@ def _target(path: _Path) -> Path:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "not a regular file", os.fspath(path))
-    # Moving a file into place needs rights on its folder alone; its own rights speak here.
+    # Moving a file into place needs permissions on its folder alone; here its own ones count.
     if not found.st_mode & 0o222 or not os.access(target, os.W_OK, effective_ids=True):
         raise PermissionError(errno.EACCES, "the file is read-only", os.fspath(path))
     return target
@@ -253,7 +253,7 @@ def _remove_if_free(aside: Path) -> None:
             os.close(held)
 
 
-def _copy_rights(target: Path, new: int | Path) -> None:
+def _copy_permissions(target: Path, new: int | Path) -> None:
     """Gives a new file the owner and the mode of the one that it replaces, if there is one."""
     with contextlib.suppress(FileNotFoundError):
         old = os.stat(target)

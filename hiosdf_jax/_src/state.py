@@ -55,7 +55,7 @@ class Flag(enum.IntFlag):
     """Returns in range fell outside the bounds. Their rays cleared space but left no surface."""
     TRAINING_FAILED = 8
     """Training was not finite. The network was kept as it was, and the next update trains it again;
-    the optimizer starts anew if it was the cause."""
+    the optimizer is reset if it was the cause."""
     OUT_OF_RANGE = 16
     """Almost no return was in range; see `Config.min_in_range`. That update changed nothing else:
     check the unit, which must be m."""

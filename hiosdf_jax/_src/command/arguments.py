@@ -9,6 +9,9 @@ from pathlib import Path
 DEMO_FRAMES = 80
 """Frames of `hiosdf demo` if --frames is not given."""
 
+_HELP_STYLE = argparse.RawDescriptionHelpFormatter  # keeps the line breaks of the examples
+_Subcommands = argparse._SubParsersAction  # argparse has no public name for it
+
 _EXAMPLES = """\
 examples:
   hiosdf demo                           map a simulated apartment, score the map and draw it
@@ -19,8 +22,8 @@ examples:
   hiosdf map --help                     streams, ground truth, and what else a run can do
   hiosdf view map.npz                   show a saved map in a browser
   hiosdf export map.npz --to map.vti    write it for ParaView, ROS, Blender, numpy
-  hiosdf info map.npz                   what a saved map is, in plain words
-  hiosdf bench                          how fast it is on this machine
+  hiosdf info map.npz                   describe a saved map
+  hiosdf bench                          measure the speed on this machine
 """
 _DEMO_EXAMPLES = """\
 examples:
@@ -48,8 +51,8 @@ examples:
   hiosdf map drive/ --save map.npz --resume map.npz
       write the map after every 100 updates, and continue it after a stop or a crash
   hiosdf map drive/ --refine-poses --drift 0.01 0.2
-      poses that drift by 1 % of the way and 0.2 degrees per meter: also writes trajectory.txt,
-      trajectory.npz and trajectory.png
+      poses that drift by 1 % of the distance traveled and 0.2 degrees per meter: also writes
+      trajectory.txt, trajectory.npz and trajectory.png
 
 The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
@@ -67,8 +70,8 @@ examples:
   hiosdf view map.npz --export scene.html    one file that needs no server, and no view
   hiosdf view map.npz --host 0.0.0.0         other machines can connect, without a password
 
-The map is what --save of hiosdf map, or hio.save, has written. The view needs the extra view: in a
-clone, pip install '.[view]'.
+MAP is a file of hiosdf map --save or of hio.save. The view needs the extra [view]: in a clone,
+pip install '.[view]'.
 """
 
 _EXPORT_EXAMPLES = """\
@@ -115,14 +118,31 @@ def parser_of(
     Returns:
         The parser.
     """
-    help_style = argparse.RawDescriptionHelpFormatter  # keeps the line breaks of the examples
     parser = argparse.ArgumentParser(
         prog="hiosdf",
         description="Signed distance fields from posed point clouds, online.",
         epilog=_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
-    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    subcommands = parser.add_subparsers(required=True, metavar="COMMAND")
+    configured, viewed = _configuration(), _viewer()
+    mapping = _mapping(configured)
+    parsers = {
+        "demo": _add_demo(subcommands, [mapping, viewed]),
+        "map": _add_map(subcommands, [mapping, viewed]),
+        "view": _add_view(subcommands, [viewed]),
+        "export": _add_export(subcommands),
+        "eval": _add_eval(subcommands),
+        "info": _add_info(subcommands),
+        "bench": _add_bench(subcommands, [configured]),
+    }
+    for name, subcommand in parsers.items():
+        subcommand.set_defaults(command=commands[name])
+    return parser
+
+
+def _configuration() -> argparse.ArgumentParser:
+    """The option of all commands that make maps."""
     sized = argparse.ArgumentParser(add_help=False)
     sized.add_argument(
         "--config",
@@ -130,6 +150,11 @@ def parser_of(
         help="size of the map: light suits a CPU, default a GPU, paper has the paper's numbers "
         "(default: light on a CPU, default on a GPU)",
     )
+    return sized
+
+
+def _mapping(sized: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """The options of `demo` and `map`."""
     common = argparse.ArgumentParser(add_help=False, parents=[sized])
     common.add_argument("--seed", type=_whole(0), help="seed of all randomness (default: 0)")
     common.add_argument(
@@ -155,8 +180,13 @@ def parser_of(
     common.add_argument(
         "--view",
         action="store_true",
-        help="show the map in a browser while it grows, and on until Ctrl-C; needs viser",
+        help="show the map in a browser while it grows, until Ctrl-C; needs viser",
     )
+    return common
+
+
+def _viewer() -> argparse.ArgumentParser:
+    """The options of the view in a browser."""
     served = argparse.ArgumentParser(add_help=False)
     served.add_argument(
         "--export",
@@ -175,15 +205,20 @@ def parser_of(
         default=8080,
         help="port of the view; the next free one is taken (default: 8080)",
     )
+    return served
 
-    demo = subparsers.add_parser(
+
+def _add_demo(
+    subcommands: _Subcommands, parents: list[argparse.ArgumentParser]
+) -> argparse.ArgumentParser:
+    demo = subcommands.add_parser(
         "demo",
-        parents=[common, served],
+        parents=parents,
         help="map a simulated apartment and score the map",
         description="Map a simulated, furnished apartment, score the map against exact distances\n"
         "and draw it. Or, with --plan, let a robot explore it.",
         epilog=_DEMO_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
     demo.add_argument(
         "--output",
@@ -203,15 +238,19 @@ def parser_of(
         help="let a robot drive to another room, knowing only its own map; --seed also chooses "
         "start and goal; needs the extra [plan]",
     )
-    demo.set_defaults(command=commands["demo"])
+    return demo
 
-    map_ = subparsers.add_parser(
+
+def _add_map(
+    subcommands: _Subcommands, parents: list[argparse.ArgumentParser]
+) -> argparse.ArgumentParser:
+    map_ = subcommands.add_parser(
         "map",
-        parents=[common, served],
+        parents=parents,
         help="map a recorded stream and score the map",
         description="Map a recorded stream of posed clouds, score the map and draw it.",
         epilog=_MAP_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
     map_.add_argument("stream", type=Path, metavar="STREAM", help="file or folder; see --format")
     map_.add_argument(
@@ -234,29 +273,37 @@ def parser_of(
         "stream's world frame and in meters, "
         "or a folder with iSDF's sdf.npy and transform.txt",
     )
+    _add_pose_options(map_)
+    _add_size_options(map_)
+    _add_format_options(map_)
+    return map_
 
+
+def _add_pose_options(map_: argparse.ArgumentParser) -> None:
     poses = map_.add_mutually_exclusive_group()
     poses.add_argument(
         "--refine-poses",
         action="store_true",
-        help="the stream's poses drift: refine each by the map so far, before the frame is fused; "
-        "exact poses get worse by it",
+        help="for poses that drift: refine each one against the map before its frame is fused; "
+        "exact poses become worse",
     )
     poses.add_argument(
         "--odometry",
         action="store_true",
-        help="use only the first pose of the stream, and find the others by the map; the motion "
-        "may change by about 10 cm and 5 degrees from frame to frame",
+        help="use only the first pose of the stream, and register the other frames to the map; "
+        "between frames the motion may change by about 10 cm and 5 degrees",
     )
     map_.add_argument(
         "--drift",
         type=float,
         nargs=2,
         metavar=("SHARE", "DEG"),
-        help="with --refine-poses: how far the motion between poses is off, as standard "
-        "deviations, a share of the way and degrees per meter, such as 0.01 0.2",
+        help="with --refine-poses: standard deviations of the motion between poses, as a share of "
+        "the distance traveled and in degrees per meter, such as 0.01 0.2",
     )
 
+
+def _add_size_options(map_: argparse.ArgumentParser) -> None:
     size = map_.add_argument_group("size of the map")
     size.add_argument(
         "--bounds",
@@ -275,6 +322,8 @@ def parser_of(
         help="returns beyond this range, m, leave no surface (default: found in a first reading)",
     )
 
+
+def _add_format_options(map_: argparse.ArgumentParser) -> None:
     formats = map_.add_argument_group("format of the stream")
     formats.add_argument(
         "--format",
@@ -308,28 +357,33 @@ def parser_of(
         metavar="FRAME",
         help="rosbag: frame of the map (default: the root of the tf tree)",
     )
-    map_.set_defaults(command=commands["map"])
 
-    view = subparsers.add_parser(
+
+def _add_view(
+    subcommands: _Subcommands, parents: list[argparse.ArgumentParser]
+) -> argparse.ArgumentParser:
+    view = subcommands.add_parser(
         "view",
-        parents=[served],
+        parents=parents,
         help="show a saved map in a browser",
         description="Show a saved map in a browser, in three dimensions.",
         epilog=_VIEW_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
-    view.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
-    view.set_defaults(command=commands["view"])
+    view.add_argument("map", type=Path, metavar="MAP", help="a saved map")
+    return view
 
-    export = subparsers.add_parser(
+
+def _add_export(subcommands: _Subcommands) -> argparse.ArgumentParser:
+    export = subcommands.add_parser(
         "export",
         help="write a saved map as a file of another program",
         description="Write a saved map as a file of another program, by the suffix of its name.",
         epilog=_EXPORT_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
     export.add_argument(
-        "map", type=Path, metavar="MAP", help="the file of a map; for .csv, that of the metrics"
+        "map", type=Path, metavar="MAP", help="a saved map; for .csv, a metrics.json"
     )
     export.add_argument("--to", type=Path, required=True, metavar="FILE", help="the file to write")
     export.add_argument(
@@ -344,21 +398,23 @@ def parser_of(
         "floor": "height of the floor, m, world frame",
         "height": "height of the robot, m",
         "radius": "radius of the robot, m",
-        "step": "what is lower above the floor is no obstacle, m (default: 0.1)",
+        "step": "obstacles up to this height above the floor are ignored, m (default: 0.1)",
     }.items():
         robot.add_argument(f"--{name}", type=float, metavar="M", help=text)
-    export.set_defaults(command=commands["export"])
+    return export
 
-    eval_ = subparsers.add_parser(
+
+def _add_eval(subcommands: _Subcommands) -> argparse.ArgumentParser:
+    eval_ = subcommands.add_parser(
         "eval",
         help="score a saved map against exact distances",
         description="Score a saved map against exact distances, where its stream has observed the\n"
         "scene: those of an .npz stream (eval_*), or a mesh.",
         epilog=_EVAL_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
-    eval_.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
-    eval_.add_argument("stream", type=Path, metavar="STREAM", help="the stream that it was made of")
+    eval_.add_argument("map", type=Path, metavar="MAP", help="a saved map")
+    eval_.add_argument("stream", type=Path, metavar="STREAM", help="the stream that was mapped")
     eval_.add_argument(
         "--ground-truth",
         type=Path,
@@ -367,28 +423,34 @@ def parser_of(
         "or a folder with iSDF's sdf.npy and transform.txt",
     )
     eval_.add_argument("--to", type=Path, metavar="FILE", help="write the scores as JSON, too")
-    eval_.set_defaults(command=commands["eval"], format=None, frames=None)
+    eval_.set_defaults(format=None, frames=None)
+    return eval_
 
-    info = subparsers.add_parser(
+
+def _add_info(subcommands: _Subcommands) -> argparse.ArgumentParser:
+    info = subcommands.add_parser(
         "info",
-        help="what a saved map is, in plain words",
+        help="describe a saved map",
         description="Describe a saved map: its extent, updates, memory, problems, configuration.",
     )
-    info.add_argument("map", type=Path, metavar="MAP", help="the file of a map")
-    info.set_defaults(command=commands["info"])
+    info.add_argument("map", type=Path, metavar="MAP", help="a saved map")
+    return info
 
-    bench = subparsers.add_parser(
+
+def _add_bench(
+    subcommands: _Subcommands, parents: list[argparse.ArgumentParser]
+) -> argparse.ArgumentParser:
+    bench = subcommands.add_parser(
         "bench",
-        parents=[sized],
-        help="how fast it is on this machine",
+        parents=parents,
+        help="measure the speed on this machine",
         description="Measure updates and queries of a map of the demo's apartment. It takes about\n"
         "a minute on two CPU cores.",
         epilog=_BENCH_EXAMPLES,
-        formatter_class=help_style,
+        formatter_class=_HELP_STYLE,
     )
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON, too")
-    bench.set_defaults(command=commands["bench"])
-    return parser
+    return bench
 
 
 def _whole(least: int) -> Callable[[str], int]:

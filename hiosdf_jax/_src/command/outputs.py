@@ -25,7 +25,7 @@ def check_outputs(options: argparse.Namespace, output: Path) -> None:
         if options.save.resolve() == other.resolve():
             raise Failure(f"--save {options.save} would replace {other}", BAD_INPUT)
     if options.save.is_file() and not is_map(options.save):
-        raise Failure(f"--save {options.save} would replace a file that is no map", BAD_INPUT)
+        raise Failure(f"--save {options.save} would replace a file that is not a map", BAD_INPUT)
 
 
 def is_map(path: Path) -> bool:

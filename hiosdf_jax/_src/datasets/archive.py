@@ -102,8 +102,8 @@ class Archive:
         """Reads the header of an array, without the array.
 
         Raises:
-            ValueError: It has none, is no array of numbers, booleans or text, or its size is not
-                that of the entry. The message names the file and the array.
+            ValueError: It has none, is not an array of numbers, booleans or text, or its size is
+                not that of the entry. The message names the file and the array.
         """
         with self._reading(name):
             return self._open(name)[0]

@@ -49,7 +49,7 @@ def read_depth(
     """Reads a depth image as a cloud.
 
     Args:
-        path: PNG with one 16-bit channel; 0 is no return.
+        path: PNG with one 16-bit channel; 0 is not a return.
         scale: m = value / scale, along the optical axis.
         matrix: (3, 3) K, pixels.
         size: Width and height that K belongs to; by default the size is not checked.

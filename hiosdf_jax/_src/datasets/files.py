@@ -1,4 +1,4 @@
-"""Text files of numbers, numbered files, and errors of foreign parsers."""
+"""Text files of numbers, numbered files, and errors of third-party parsers."""
 
 from __future__ import annotations
 

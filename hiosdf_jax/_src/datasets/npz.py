@@ -3,9 +3,9 @@
 Every file has `poses` (F, 4, 4), T_world_sensor in m, and one of
 
 - `depth` (F, H, W), `K` (3, 3), `depth_scale`: m = depth / depth_scale along the optical axis;
-  0 is no return, as are the values listed in the optional `invalid`;
+  0 is not a return, as are the values listed in the optional `invalid`;
 - `range` (F, ...), `directions` (..., 3) unit vectors, `range_scale`: m = range / range_scale;
-  0 is no return;
+  0 is not a return;
 - `points_mm` (P, 3) mm, sensor frame, `offsets` (F + 1,): frame i has the rows offsets[i] to
   offsets[i + 1].
 

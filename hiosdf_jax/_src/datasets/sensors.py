@@ -28,7 +28,7 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
         ValueError: Depth has fewer than two dimensions or intrinsics is not (3, 3).
 
     Example:
-        depth = depth_mm / 1000.0  # (480, 640) m; 0 is no return
+        depth = depth_mm / 1000.0  # (480, 640) m; 0 is not a return
         intrinsics = [[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]]
         state = hio.update(state, datasets.depth_to_cloud(depth, intrinsics), pose)
     """

@@ -49,7 +49,7 @@ class Stream(Protocol):
             index: 0 <= index < len(self).
 
         Returns:
-            cloud: (N, 3) float32, m, sensor frame; a row with a NaN or inf is no return.
+            cloud: (N, 3) float32, m, sensor frame; a row with a NaN or inf is not a return.
             pose: (4, 4) float32, T_world_sensor.
 
         Raises:
@@ -99,7 +99,7 @@ class FrameStream:
             index: -len(self) <= index < len(self).
 
         Returns:
-            cloud: (N, 3) float32, m, sensor frame; a row with a NaN or inf is no return.
+            cloud: (N, 3) float32, m, sensor frame; a row with a NaN or inf is not a return.
             pose: (4, 4) float32, T_world_sensor.
 
         Raises:

@@ -62,7 +62,7 @@ class DepthCamera:
             seed: Seed of the noise, for `numpy.random.default_rng`.
 
         Returns:
-            (height * width, 3) float32, m, sensor frame, row-major; a row of NaN is no return.
+            (height * width, 3) float32, m, sensor frame, row-major; a row of NaN is not a return.
         """
         depth = self.exact_depth(pose)
         if self.noise:

@@ -2,7 +2,7 @@
 
 Voxel i covers [i, i + 1) * voxel_size along an axis of the world frame. The grid holds the voxels
 from `config.corner_index` on. The voxel of a point therefore does not depend on the bounds, and a
-grown map answers bit by bit as before.
+grown map answers bit for bit as before.
 """
 
 from __future__ import annotations

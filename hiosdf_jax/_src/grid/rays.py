@@ -58,7 +58,7 @@ def place_cloud(
     Args:
         config: The map's configuration.
         cloud: (N, 3) m, sensor frame.
-        finite: (N,) bool; other rows are no returns.
+        finite: (N,) bool; other rows are not returns.
         pose: (4, 4) T_world_sensor.
         noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m; that of the
             configuration by default.

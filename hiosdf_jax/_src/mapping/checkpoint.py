@@ -1,4 +1,4 @@
-"""Saves a map to one file and loads it; a resumed run continues bit by bit."""
+"""Saves a map to one file and loads it; a resumed run continues bit for bit."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FILE_NAMES = {
 }
 
 # Arrays that files of older versions do not have, by the version that has them first. They are zero
-# there; those that follow from others are computed anew.
+# there; those that follow from others are recomputed.
 _SINCE = {
     3: ("grid.change", "report.points_moving", "report.refused_in_row", "report.update_flags"),
     4: ("grid.surface.side",),
@@ -51,7 +51,7 @@ def save(path: str | os.PathLike[str], state: MapState) -> None:
     """Writes the whole map to one compressed .npz file, without pickle.
 
     The file is replaced when all of it is on the disk, so that a crash keeps the old file. The
-    rights of an old file are kept. A link stays, and the file that it leads to is replaced.
+    permissions of an old file are kept. A link stays, and the file that it leads to is replaced.
 
     Args:
         path: The file; its folder must exist.

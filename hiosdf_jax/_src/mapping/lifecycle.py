@@ -99,7 +99,7 @@ def grow(state: MapState, bounds: Any) -> MapState:
         bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame; they contain the old bounds.
 
     Returns:
-        The map in the new box. It shares no memory with the old map, and answers bit by bit as
+        The map in the new box. It shares no memory with the old map, and answers bit for bit as
         before inside the old box.
 
     Raises:

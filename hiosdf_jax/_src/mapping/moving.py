@@ -37,13 +37,13 @@ def moving_rows(
 
     Args:
         state: The map before the cloud.
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
         pose: (4, 4) T_world_sensor, rigid.
         robot: As for `update`.
         noise: As for `update`.
 
     Returns:
-        (N,) bool; False for rows that are no returns.
+        (N,) bool; False for rows that are not returns.
 
     Raises:
         ValueError: An argument has a wrong type or shape. Outside jit also: the pose is not finite

@@ -59,7 +59,7 @@ def update(
 
     Args:
         state: The map so far.
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
         pose: (4, 4) T_world_sensor, rigid.
         donate: Reuse the memory of `state` for the new map. This is faster on a GPU, not on a CPU.
             The old map, its `report` and a `BackgroundMapper` that began with it become invalid.
@@ -140,7 +140,7 @@ def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
 
     Args:
         config: The map's configuration.
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns. Not inside jit.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored. Not inside jit.
         pose: The cloud's pose, (4, 4). It matters for clouds of more than `max_points` rows: with
             it, the same rows are drawn as by `update`.
 
@@ -167,7 +167,7 @@ def check_and_pad(cloud: Any, pose: Any, capacity: int) -> tuple[np.ndarray, np.
     """Checks the values of a cloud and its pose, and brings the cloud to a fixed shape.
 
     Args:
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
         pose: (4, 4) T_world_sensor.
         capacity: Rows of the result, see `_pad_rows`.
 
@@ -235,7 +235,7 @@ def warn_out_of_range(
     """Warns of a cloud with almost no return in range, and names the likely unit.
 
     Args:
-        cloud: (N, 3) m, sensor frame; rows with a NaN are no returns.
+        cloud: (N, 3) m, sensor frame; rows with a NaN are ignored.
         min_range: Least range of a return that counts, m.
         max_range: Largest range of a return that counts, m.
         min_share: Least share of the returns that must be in range.
@@ -284,7 +284,7 @@ def warn_outside(
     """Warns of a cloud with almost no return inside the bounds, among those in range.
 
     Args:
-        cloud: (N, 3) m, sensor frame; rows with a NaN are no returns.
+        cloud: (N, 3) m, sensor frame; rows with a NaN are ignored.
         pose: (4, 4) T_world_sensor.
         bounds: ((x0, y0, z0), (x1, y1, z1)) m, world frame.
         min_range: Least range of a return that counts, m.

@@ -50,7 +50,7 @@ def track(
 
     Args:
         state: The map so far.
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
         predicted_pose: (4, 4) T_world_sensor, a few centimeters and degrees off; for instance from
             `predict_pose`.
         prior: As for `refine_pose`. By default the predicted pose, with a standard deviation of a

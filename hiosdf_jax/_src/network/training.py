@@ -89,7 +89,7 @@ def train(
 
     Returns:
         network: The trained network; unchanged if training was not finite. An optimizer that was
-            not finite before is then started anew: otherwise no later training would be finite.
+            not finite before is then reset: otherwise no later training would be finite.
         parts: The mean losses of the last epoch.
         finite: Whether losses, weights and the optimizer are finite, () bool.
     """
@@ -171,7 +171,7 @@ def _order(config: Config, count: int, key: jax.Array) -> jax.Array:
     if config.batches > 1:
         return jnp.argsort(jax.random.bits(key, (count,), jnp.uint32))
     if config.eikonal_every > 1:
-        # The samples are drawn anew at every update, so one order suffices. Their own order would
+        # Every update draws new samples, so one order suffices. Their own order would
         # not do: there each n-th sample of a ray is at the same depth.
         return jnp.asarray(np.random.default_rng(0).permutation(count))
     return jnp.arange(count)

@@ -14,14 +14,14 @@ def on_device(name: str, values: Any) -> jax.Array:
     """Converts an argument to float32, by a transfer that `jax.transfer_guard` counts as explicit.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         values: As for `as_array`.
 
     Returns:
         The array.
 
     Raises:
-        ValueError: The values are no real numbers.
+        ValueError: The values are not real numbers.
     """
     array = as_array(name, values)
     return array if isinstance(array, jax.Array) else jax.device_put(array)

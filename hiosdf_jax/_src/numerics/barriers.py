@@ -16,7 +16,7 @@ _barred = contextvars.ContextVar("_barred", default=True)
 
 @contextlib.contextmanager
 def no_barriers() -> Iterator[None]:
-    """Leaves barriers out of what is traced: in a kernel of ours, all is computed once."""
+    """Leaves barriers out of what is traced: in our kernels, all is computed once."""
     token = _barred.set(False)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Which kernels of ours a device can run."""
+"""Which of our kernels a device can run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _TRIED_BEFORE = (0, 13)  # jax changes its interface for GPU kernels from versio
 def has_kernels() -> bool:
     """Returns whether the default backend is one Hopper GPU, and jax a version that was tried.
 
-    XLA cannot divide a kernel of ours among several devices.
+    XLA cannot divide one of our kernels among several devices.
     """
     if jax.__version_info__ >= _TRIED_BEFORE:
         return False

@@ -17,7 +17,7 @@ import numpy as np
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M, TOLERANCE, is_rigid_on_host
 
 _DEEPEST = 16  # an array has three axes or four
-_NESTED = list, tuple  # `list | tuple` would be made anew for each of the leaves of a map
+_NESTED = list, tuple  # `list | tuple` would be created again for each leaf of a map
 _MOST_WHOLE = 2**31 - 1  # a loop counts in int32
 _LEAST_VARIANCE = 1e-20  # of a pose, m^2 or rad^2; its square is a number of float32
 _ROUNDING = 1e-5  # of the eigenvalues of a correlation matrix (6, 6) in float32
@@ -30,8 +30,8 @@ def as_real(name: str, values: Any) -> np.ndarray:
     """Checks that an argument is an array of real numbers.
 
     Args:
-        name: What messages call the argument.
-        values: Concrete numbers in an array, or what numpy makes one of.
+        name: Name of the argument in error messages.
+        values: Concrete numbers: an array, or anything that `np.asarray` accepts.
 
     Returns:
         The numbers in their own type, not copied; masked elements are NaN.
@@ -45,8 +45,8 @@ def as_real(name: str, values: Any) -> np.ndarray:
         raise ValueError(f"{name} has booleans, expected real numbers")
     try:
         array = np.ma.asanyarray(values) if _has_mask(values) else np.asarray(values)
-    except Exception as error:  # rows of different lengths, or whatever a foreign object raises
-        raise ValueError(f"{name} is no array of numbers: {error}") from error
+    except Exception as error:  # rows of different lengths, or whatever a third-party object raises
+        raise ValueError(f"{name} is not an array of numbers: {error}") from error
     _check_type(name, array)
     if not np.ma.isMaskedArray(array):
         return array
@@ -59,8 +59,8 @@ def as_floats(name: str, values: Any) -> np.ndarray:
     """Converts an argument to float32. Masked elements become NaN, those too large inf.
 
     Args:
-        name: What messages call the argument.
-        values: Concrete numbers in an array, or what numpy makes one of.
+        name: Name of the argument in error messages.
+        values: Concrete numbers: an array, or anything that `np.asarray` accepts.
 
     Returns:
         The array; not a copy if it is float32 already.
@@ -76,14 +76,14 @@ def as_array(name: str, values: Any) -> np.ndarray | jax.Array:
     """Converts an argument that may be traced, or lie on a device, to float32.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         values: Numbers, as for `as_floats`, or arrays of JAX, also in lists.
 
     Returns:
         An array of JAX if one came, otherwise as from `as_floats`. Nothing waits for a device.
 
     Raises:
-        ValueError: The values are no real numbers.
+        ValueError: The values are not real numbers.
     """
     if not any(isinstance(leaf, jax.Array) for leaf in _leaves(values)):
         return as_floats(name, values)
@@ -99,15 +99,15 @@ def as_array(name: str, values: Any) -> np.ndarray | jax.Array:
         array = values if isinstance(values, jax.Array) else jnp.asarray(values)
         _check_type(name, array)
         return array.astype(jnp.float32)
-    except Exception as error:  # unequal shapes, or whatever a foreign object raises
-        raise ValueError(f"{name} is no array of numbers: {error}") from error
+    except Exception as error:  # unequal shapes, or whatever a third-party object raises
+        raise ValueError(f"{name} is not an array of numbers: {error}") from error
 
 
 def as_number(name: str, value: Any, least: float | None = None, *, above: bool = False) -> float:
     """Checks one finite number.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         value: The number, not traced.
         least: Its least value.
         above: The number must be larger than `least`.
@@ -132,7 +132,7 @@ def check_whole(name: str, value: Any, least: int, most: int = _MOST_WHOLE) -> N
     """Checks a count that shapes or loops depend on.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         value: The count, not traced.
         least: Its least value.
         most: Its largest value.
@@ -151,7 +151,7 @@ def as_key(name: str, key: Any) -> jax.Array:
     """Checks that an argument is one random key.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         key: From `jax.random.key`, or an older one from `PRNGKey`; may be traced.
 
     Returns:
@@ -162,7 +162,7 @@ def as_key(name: str, key: Any) -> jax.Array:
     """
     try:
         array = key if isinstance(key, jax.Array) else jnp.asarray(key)
-    except Exception as error:  # whatever a foreign object raises
+    except Exception as error:  # whatever a third-party object raises
         raise ValueError(f"{name} is {type(key).__name__}, expected one jax.random.key") from error
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) and array.shape == ():
         return array
@@ -207,7 +207,7 @@ def cloud_and_returns(cloud: Any) -> tuple[np.ndarray, np.ndarray]:
     """Checks a cloud and finds its returns.
 
     Args:
-        cloud: (N, 3) m; a row with a NaN or inf is no return.
+        cloud: (N, 3) m; a row with a NaN or inf is not a return.
 
     Returns:
         The cloud as from `checked_cloud`, and a mask of its returns, (N,) bool, at least one of
@@ -244,7 +244,7 @@ def check_vectors(name: str, vectors: Any) -> None:
     """Checks that an array holds vectors, (..., 3); its values may be traced.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         vectors: An array.
 
     Raises:
@@ -290,7 +290,7 @@ def check_covariance(name: str, covariance: np.ndarray) -> None:
     """Checks that a matrix is the covariance of the error of a pose.
 
     Args:
-        name: What messages call the argument.
+        name: Name of the argument in error messages.
         covariance: (6, 6), m and rad.
 
     Raises:

@@ -222,7 +222,7 @@ def edge_of_unseen(field: Field) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thin_cloud(cloud: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Places the newest cloud in the world, without rows that are no returns.
+    """Places the newest cloud in the world, without rows that are not returns.
 
     Args:
         cloud: (N, 3) m, sensor frame.

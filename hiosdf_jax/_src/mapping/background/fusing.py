@@ -71,7 +71,7 @@ class Fuser:
 
         Args:
             frame: The frame, from `checked`.
-            serve: What to make of the snapshot.
+            serve: Function applied to the snapshot.
 
         Returns:
             The new field and its stamp. All of it is computed: no reader waits for the device.
@@ -111,7 +111,7 @@ def publish(state: MapState, serve: Serve, stamp: float = -math.inf) -> Publishe
 
     Args:
         state: The map.
-        serve: What to make of its snapshot.
+        serve: Function applied to its snapshot.
         stamp: Time of its newest frame, s; -inf before the first one.
 
     Returns:

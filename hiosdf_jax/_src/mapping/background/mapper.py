@@ -63,8 +63,8 @@ class BackgroundMapper:
 
     Attributes:
         field: The newest snapshot, or what `serve` has made of it, with the stamp of its frame.
-        serve: What to make of each snapshot. It may be replaced at any time, for instance to move a
-            window with the robot; it is used from the next fused frame on.
+        serve: Function applied to each snapshot; its result becomes `field`. It may be replaced at
+            any time, for instance to move a window with the robot. The next fused frame uses it.
         dropped: Number of frames that newer ones replaced.
         rejected: Number of frames that left `field` and its stamp as they were: `update` raised an
             exception or refused them, or `serve` raised one.
@@ -85,9 +85,10 @@ class BackgroundMapper:
 
         Args:
             state: The map so far, from `init`, `load` or another mapper. Do not donate it later.
-            serve: What to make of each snapshot, beside the controller: for instance `hio.bake` of
-                a window around the robot. It is called once before this returns. A process takes a
-                function that it can import, or `functools.partial` of one.
+            serve: Function applied to each snapshot, beside the controller; its result becomes
+                `field`. For instance `hio.bake` of a window around the robot. It is called once
+                before this returns. A process takes a function that it can import, or
+                `functools.partial` of one.
             process: Whether to map in a process of its own.
 
         Raises:
@@ -123,7 +124,7 @@ class BackgroundMapper:
 
     @property
     def serve(self) -> Serve:
-        """What to make of each snapshot; None for the snapshot itself."""
+        """Function applied to each snapshot; None for the snapshot itself."""
         return self._serve
 
     @serve.setter

@@ -37,8 +37,8 @@ def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
     """Expresses a map in another frame.
 
     The network is the same in its new frame, and answers as before up to rounding. The grid is
-    binned anew: patches move exactly and those that meet in a voxel add up; observed space shrinks
-    by up to a voxel. By whole voxels and turns of 90 degrees, the grid is only indexed anew. What
+    re-binned: patches move exactly and those that meet in a voxel add up; observed space shrinks
+    by up to a voxel. By whole voxels and turns of 90 degrees, the grid is only re-indexed. What
     falls outside of the new box is lost.
 
     Args:
@@ -103,7 +103,7 @@ def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapS
     """Makes one map of submaps at corrected poses, for instance after a loop closure.
 
     Keep the submaps as they were mapped, and call this again with each new correction: what is lost
-    when a grid is binned anew is then lost once.
+    when a grid is re-binned is then lost once.
 
     Args:
         submaps: One map or more, each in a frame of its own. The first one gives the configuration,

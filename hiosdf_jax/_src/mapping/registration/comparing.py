@@ -303,12 +303,12 @@ class Sums(NamedTuple):
 
     @property
     def loss(self) -> jax.Array:
-        """Sum of the losses of the returns about which the map tells something, ()."""
+        """Sum of the losses of the returns that the map can judge, ()."""
         return self.values[27]
 
     @property
     def known(self) -> jax.Array:
-        """Number of the returns about which the map tells something, ()."""
+        """Number of the returns that the map can judge, ()."""
         return self.values[28]
 
     @property

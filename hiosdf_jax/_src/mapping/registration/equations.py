@@ -55,7 +55,7 @@ _LEAST_INFORMATION_SHARE = 1e-6
 LEAST_COMPARABLE = 0.1
 """Share of the returns that must lie where the map has observed."""
 
-# What a return about which the map tells nothing has more than the mean loss of the worse of two
+# What a return that the map cannot judge has more than the mean loss of the worse of two
 # poses. Without it, clouds with 15 % of outliers are moved to where the map ends.
 _UNKNOWN_MORE = 0.1
 
@@ -156,7 +156,7 @@ class Fit(NamedTuple):
     """How badly returns fit.
 
     Attributes:
-        loss: Mean loss of the returns about which the map tells something, () from 0 to 1; inf if
+        loss: Mean loss of the returns that the map can judge, () from 0 to 1; inf if
             they are too few. A return in space that was seen empty has loss 1.
         known: Their share of all returns, ().
     """
@@ -178,7 +178,7 @@ def fits_better(one: Fit, other: Fit, least: jax.Array | float = 0.0) -> jax.Arr
 
     The mean loss must differ by more than `least`.
 
-    A return about which the map tells nothing counts more than a known one in the worse pose. So no
+    A return that the map cannot judge counts more than a known one in the worse pose. So no
     pose is better because fewer returns can be compared there.
     """
     unknown = jnp.maximum(one.loss, other.loss) + _UNKNOWN_MORE

@@ -105,7 +105,7 @@ def refine_pose(
 
     Args:
         field: A map, a snapshot of one, or a baked field.
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
         pose: (4, 4) T_world_sensor, where to begin.
         prior: (mean, covariance): a pose (4, 4) and the covariance of its error (6, 6), as in
             `Registration`, such as that of odometry. Without one, directions that the cloud does

@@ -117,7 +117,7 @@ def relocalize(
 
     Args:
         field: A map, a snapshot of one, or a baked field.
-        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are no returns and are ignored.
+        cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
         key: Source of the hypotheses, from `jax.random.key`.
         hypotheses: How many random poses are tried, at least 256. The default is one per 4 voxels
             of the map, from 65,536 to 4,194,304.

@@ -23,12 +23,12 @@ def draw_evenly(cloud: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     """Selects finite rows of a cloud at even steps.
 
     Args:
-        cloud: (N, 3) m; a row with a NaN or inf is no return.
+        cloud: (N, 3) m; a row with a NaN or inf is not a return.
         count: Most rows to select.
 
     Returns:
         The rows (min(N, count), 3) m, 0 where there is none, and a mask (min(N, count),) of those
-        that are returns. Rows that are no returns do not change which others are selected.
+        that are returns. Rows that are not returns do not change which others are selected.
     """
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     count = min(count, cloud.shape[0])

@@ -109,7 +109,7 @@ def _check_registered(registered: Any | None, count: int) -> np.ndarray:
     try:
         mask = np.ma.filled(np.ma.asanyarray(registered), False)
     except ValueError as error:  # rows of different lengths
-        raise ValueError(f"registered is no array: {error}") from error
+        raise ValueError(f"registered is not an array: {error}") from error
     if mask.shape != (count,) or mask.dtype != bool:
         raise ValueError(f"registered is {mask.dtype} {mask.shape}, expected bool ({count},)")
     return mask

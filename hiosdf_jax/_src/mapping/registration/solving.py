@@ -204,7 +204,7 @@ class Selection(NamedTuple):
 
     Attributes:
         index: Their numbers among all rows, (K,) int32.
-        rows: The rows; they lie on narrower patches than others, so their share is measured anew.
+        rows: The rows; they lie on narrower patches than others, so their share is measured again.
         directions: Principal directions of all returns.
     """
 
