@@ -372,13 +372,14 @@ def _from_flax(state: MapState, data: dict[str, Any]) -> MapState:
 flax.serialization.register_serialization_state(MapState, _to_flax, _from_flax, override=True)
 
 
-def check_map(state: Any, stacked: bool = False) -> None:
-    """Raises a ValueError if an argument named `state` is not a map, or not a single one."""
+def check_map(state: Any, stacked: bool = False, name: str = "state") -> None:
+    """Raises a ValueError if an argument is not a map, or not a single one."""
     if not isinstance(state, MapState):
-        raise ValueError(f"state is {type(state).__name__}, expected a MapState from hio.init")
-    _check_kept("state", state)
-    if not stacked:
-        check_single("state", state)
+        raise ValueError(f"{name} is {type(state).__name__}, expected a MapState from hio.init")
+    if stacked:
+        _check_kept(name, state)
+    else:
+        check_single(name, state)
 
 
 def check_single(name: str, field: MapState | Field | Baked) -> None:

@@ -25,12 +25,12 @@ from hiosdf_jax._src.demo.sensing import (
     robot_camera,
     scan_from_above,
 )
-from hiosdf_jax._src.field.queries import Unknown
 from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.state import Field
 
 # A body 0.4 m wide, from 0.15 m to 1.25 m above the floor.
 ROBOT = Robot(heights=(0.35, 0.49, 0.63, 0.77, 0.91, 1.05))
+_UNKNOWN = "obstacle"  # space that no ray has reached is solid
 _REACHED = 0.25  # m from the goal
 _CELL = 0.1  # m, of the geodesic's plane
 
@@ -84,13 +84,11 @@ class Run(NamedTuple):
     metrics: dict[str, Any]
 
 
-def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
+def explore(seed: int) -> Run:
     """Lets a robot find its way to a goal in another room.
 
     Args:
         seed: Seed of start and goal, and of the randomness of camera, map and MPPI.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
-            uses the map's prediction.
 
     Returns:
         The run. `metrics["reached"]` and `metrics["collided"]` give the outcome.
@@ -101,7 +99,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
     problem = draw_problem(model, ROBOT, plane, CAMERA_HEIGHT, seed)
     camera = robot_camera(model)
     key, plan_key = jax.random.split(jax.random.key(seed))
-    driver = make_driver(ROBOT, unknown, plan_key)
+    driver = make_driver(ROBOT, _UNKNOWN, plan_key)
     map_state = scan_from_above(lifecycle.init(map_config(), key), problem.start[:2])
 
     state, plan = jnp.array([*problem.start, 0.0, 0.0], jnp.float32), driver.plan
@@ -124,7 +122,7 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
             rollouts = np.asarray(driver.rollouts(plan, state))[..., :2]
             moments.append(Moment(k, cells, path_from(xy), rollouts, watch.turning))
         assert task is not None and path_from is not None and field is not None
-        clearances.append(float(_clearance(ROBOT, field, state, unknown)))
+        clearances.append(float(_clearance(ROBOT, field, state, _UNKNOWN)))
 
         start = time.perf_counter()
         if watch.turning:
@@ -145,14 +143,14 @@ def explore(seed: int, unknown: Unknown = "obstacle") -> Run:
             barred |= _bar(plane, path_from(moved[-1, :2]), moments[-1].cells)
 
     assert field is not None
-    clearances.append(float(_clearance(ROBOT, field, state, unknown)))
+    clearances.append(float(_clearance(ROBOT, field, state, _UNKNOWN)))
     path = np.concatenate([problem.start[None, :2], *passed])
     exact = exact_clearance(model, ROBOT, path)
     exact = np.concatenate([exact[:1], exact[1:].reshape(len(passed), -1).min(axis=1)])
     first_drive = next((moment for moment in moments if not moment.turning), moments[-1])
     metrics = {
         "seed": seed,
-        "unknown": unknown,
+        "unknown": _UNKNOWN,
         "from": problem.rooms[0],
         "to": problem.rooms[1],
         "start": problem.start.tolist(),

@@ -21,6 +21,7 @@ PathFrom = Callable[[np.ndarray], np.ndarray]
 _UNSEEN = 1.5
 _NEAR = 3.0
 _BLOCKED = 100.0
+_AHEAD_M = 0.6  # distance of the place on the path toward which a robot heads
 _REACH_INTO_UNSEEN = 0.3  # m beyond observed space in which surfaces still count
 
 
@@ -143,13 +144,12 @@ def cost_to_go(costs: np.ndarray, plane: Plane, goal: np.ndarray) -> tuple[np.nd
     return to_go, path_from
 
 
-def heading_along(path: np.ndarray, xy: np.ndarray, ahead: float = 0.6) -> np.ndarray:
+def heading_along(path: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Returns the direction from a point to a place a little ahead on a path.
 
     Args:
         path: (P, 2) m.
         xy: (2,) m.
-        ahead: Distance of that place from the point, m.
 
     Returns:
         (2,) unit vector, or zero at the path's end.
@@ -157,7 +157,7 @@ def heading_along(path: np.ndarray, xy: np.ndarray, ahead: float = 0.6) -> np.nd
     offsets = path - xy
     lengths = np.linalg.norm(offsets, axis=1)
     start = int(np.argmin(lengths))
-    beyond = np.nonzero(lengths[start:] >= ahead)[0]
+    beyond = np.nonzero(lengths[start:] >= _AHEAD_M)[0]
     target = start + int(beyond[0]) if len(beyond) else len(path) - 1
     return offsets[target] / max(lengths[target], 1e-6)
 

@@ -14,6 +14,7 @@ from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid
 from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.numerics.intake import as_floats, is_traced
+from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.vectors import each
 from hiosdf_jax._src.state import Evidence, Grid, MapState, check_map
@@ -59,7 +60,7 @@ def _forget(config: Config, grid: Grid, corners: jax.Array) -> Grid:
     inside = x & y & z
 
     def clear(known: jax.Array, empty: jax.Array) -> jax.Array:
-        return jnp.where(inside.reshape(*inside.shape, *[1] * (known.ndim - 3)), empty, known)
+        return where_leading(~inside, known, empty)
 
     evidence: Evidence = jax.tree.map(clear, grid.evidence, empty_grid(config).evidence)
     grid = grid.replace(evidence=evidence)

@@ -27,6 +27,6 @@ def on_device(name: str, values: Any) -> jax.Array:
     return array if isinstance(array, jax.Array) else jax.device_put(array)
 
 
-def scalar(value: Any, dtype: Any = np.float32) -> jax.Array:
-    """Makes a number an array () on the device, by an explicit transfer."""
-    return jax.device_put(np.asarray(value, dtype))
+def scalar(value: Any) -> jax.Array:
+    """Makes a number a float32 array () on the device, by an explicit transfer."""
+    return jax.device_put(np.float32(value))

@@ -13,6 +13,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, fade_evidence
 from hiosdf_jax._src.mapping.joining.doubles import drop_doubles, is_sure, is_surface
+from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
 
@@ -125,10 +126,7 @@ def _add(first: EvidenceWindow, second: EvidenceWindow) -> EvidenceWindow:
     axes = patches.axes_of(spread.reshape(-1, 3, 3), facing.reshape(-1, 3)).reshape(spread.shape)
 
     def choose(merged: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
-        def wide(mask: jax.Array) -> jax.Array:
-            return mask.reshape(*mask.shape, *[1] * (merged.ndim - 3))
-
-        return jnp.where(wide(both), merged, jnp.where(wide(other), b, a))
+        return where_leading(both, merged, where_leading(other, b, a))
 
     hidden = (first.passes < 0) | (second.passes < 0)
     passes = jnp.abs(first.passes) + jnp.abs(second.passes)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, rounded
+from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import dot, each, length, split, unit
 
@@ -102,8 +103,7 @@ def _without(window: EvidenceWindow, dropped: jax.Array) -> EvidenceWindow:
     """Returns the evidence without some patches."""
 
     def clear(values: jax.Array) -> jax.Array:
-        mask = dropped.reshape(*dropped.shape, *[1] * (values.ndim - 3))
-        return jnp.where(mask, jnp.zeros_like(values), values)
+        return where_leading(~dropped, values, 0)
 
     return window._replace(
         hits=clear(window.hits),

@@ -22,7 +22,7 @@ from hiosdf_jax._src.numerics.intake import as_array, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain, varying_like
 from hiosdf_jax._src.numerics.rigid import is_rigid, nearest_rotation
 from hiosdf_jax._src.samples.from_grid import sample_grid
-from hiosdf_jax._src.state import Flag, Grid, MapState, Network, check_single
+from hiosdf_jax._src.state import Flag, Grid, MapState, Network, check_map
 
 # What the arrays of a map depend on. Maps in which these differ do not add up.
 _SHARED = ("voxel_size", "range_noise", "hidden_width", "hidden_layers", "frequency")
@@ -59,7 +59,7 @@ def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
         >>> moved = hio.transform(state, pose)
         >>> hio.sdf(moved, points @ pose[:3, :3].T + pose[:3, 3])  # about hio.sdf(state, points)
     """
-    _check_map("state", state)
+    check_map(state)
     config = _in_bounds(state.config, bounds)
     matrix = _checked_pose("pose", pose)
     joined = _join if is_traced(*jax.tree.leaves(state), matrix) else _join_jit
@@ -91,8 +91,8 @@ def merge(a: MapState, b: MapState, pose_a_b: Any) -> MapState:
     Example:
         >>> both = hio.merge(hio.grow(a, bounds), b, pose_a_b)
     """
-    _check_map("a", a)
-    _check_map("b", b)
+    check_map(a, name="a")
+    check_map(b, name="b")
     _check_fits("a", a, "b", b)
     matrix = _checked_pose("pose_a_b", pose_a_b)
     joined = _join if is_traced(*jax.tree.leaves((a, b)), matrix) else _join_jit
@@ -129,7 +129,7 @@ def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapS
         found = "empty" if is_list else type(submaps).__name__
         raise ValueError(f"submaps is {found}, expected a list of maps, at least 1")
     for i, submap in enumerate(submaps):
-        _check_map(f"submaps[{i}]", submap)
+        check_map(submap, name=f"submaps[{i}]")
         _check_fits("submaps[0]", submaps[0], f"submaps[{i}]", submap)
     matrices = as_array("poses", poses)
     if matrices.shape != (len(submaps), 4, 4):
@@ -240,12 +240,6 @@ def _skip(_: Grid, network: Network, key: jax.Array) -> tuple[jax.Array, Network
 
 def _exact(pose: jax.Array) -> jax.Array:
     return pose.at[:3, :3].set(nearest_rotation(pose[:3, :3]))
-
-
-def _check_map(name: str, state: Any) -> None:
-    if not isinstance(state, MapState):
-        raise ValueError(f"{name} is {type(state).__name__}, expected a MapState from hio.init")
-    check_single(name, state)
 
 
 def _check_fits(name: str, state: MapState, other_name: str, other: MapState) -> None:

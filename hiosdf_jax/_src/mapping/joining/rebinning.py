@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, fade_evidence
+from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import Vector, each, join, length, split
 from hiosdf_jax._src.state import Evidence
@@ -56,8 +57,7 @@ def rebin(source: Config, evidence: Evidence, target: Config, pose: jax.Array) -
         return jnp.where(has_patch, patch, other).reshape(shape)
 
     def choose_vectors(values: jax.Array) -> jax.Array:
-        mask = has_patch.reshape(-1, *[1] * (values.ndim - 1))
-        return jnp.where(mask, values, 0).reshape(*shape, *values.shape[1:])
+        return where_leading(has_patch, values, 0).reshape(*shape, *values.shape[1:])
 
     window = EvidenceWindow(
         start=moved.start,
