@@ -238,7 +238,7 @@ def rows(heading, page=ARCHITECTURE):
 def test_messages_that_need_help_are_those_of_the_package():
     files = sorted((ROOT / "hiosdf_jax").rglob("*.py"))
     source = " ".join(path.read_text("utf-8") for path in files)
-    for message, *_ in rows("What it says", ROOT / "docs" / "troubleshooting.md"):
+    for message, *_ in rows("Messages and flags", ROOT / "docs" / "troubleshooting.md"):
         assert message.strip("`") in source, message
 
 

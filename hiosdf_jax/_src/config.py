@@ -48,8 +48,8 @@ class Config:
         min_range: Nearer returns are ignored, m.
         max_range: Farther returns only clear their ray up to this range, m.
         range_noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m.
-            Hits are averaged with weight 1 / sigma^2. A thing that appears is new from three of
-            these and 1.5 voxels before known surfaces: 0.65 m at 9 m.
+            Hits are averaged with weight 1 / sigma^2. A return counts as a new thing if it lies
+            three standard deviations and 1.5 voxels in front of known surfaces: 0.65 m at 9 m.
         min_in_range: A cloud with a smaller share of its returns between min_range and max_range
             changes nothing and raises `Flag.OUT_OF_RANGE`. With 0 its rays clear space. Outside
             jit, `update` warns if a smaller share of the returns in range lies in the bounds.
@@ -85,7 +85,7 @@ class Config:
         Training [IV-D]:
         sdf_weight: Weight of the L1 distance loss.
         eikonal_weight: Weight of the Eikonal loss.
-        eikonal_every: The Eikonal loss uses one sample in this many, other samples in each epoch.
+        eikonal_every: The Eikonal loss uses every n-th sample, with another offset in each epoch.
         learning_rate: AdamW learning rate.
         weight_decay: AdamW weight decay.
         batches: Gradient steps per epoch, each on its share of the samples; the paper's full-batch
@@ -95,8 +95,8 @@ class Config:
         warmup_updates: Number of warm-up updates.
 
         Queries:
-        weight_average: Share of the old weights in the average over updates that queries use. With
-            0 they use the latest weights. Training never uses the average.
+        weight_average: Queries use a running average of the weights, in which the previous average
+            has this share. With 0 they use the latest weights. Training never uses the average.
         grid_share: Share of the grid's distance in the answer where the grid has one. The network
             has the rest, and answers alone beyond the horizon. With 0 the network answers alone,
             as in the paper.
@@ -338,7 +338,7 @@ _LIGHT: dict[str, Any] = {
 }
 
 
-# What editors show: `__new__` itself takes anything, to name what it refuses.
+# Editors show this signature. `__new__` itself takes anything, so that its message can name it.
 Config.__new__.__dict__["__signature__"] = inspect.signature(Config.__init__)
 
 

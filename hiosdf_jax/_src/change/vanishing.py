@@ -33,9 +33,9 @@ _LEAST_HALF_VOXELS = 0.15
 # Rays that graze a patch may pass beside it.
 _LEAST_COSINE = 0.2
 
-# A scan counts by the quarters of a patch that its rays cross: 3 for all, 2 for three, 1 for two.
-# Two count 2 if several rays cross them, such as a ring of a LiDAR. A scan of `vanish_scans` is
-# worth this many.
+# A scan adds doubt by the quarters of a patch that its rays cross: 3 for four quarters, 2 for
+# three, 1 for two. Two quarters add 2 if several rays cross them, such as a ring of a LiDAR.
+# `vanish_scans` counts scans that add this much.
 _DOUBT_PER_SCAN = 2
 _SEVERAL_RAYS = 3
 

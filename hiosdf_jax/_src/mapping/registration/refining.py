@@ -98,35 +98,36 @@ def refine_pose(
 ) -> Registration:
     """Finds the pose near a given one at which a cloud lies on the surfaces of a map.
 
-    Gauss-Newton steps on the distances, with weights that outliers lose. The pose may be 15 cm
-    and 6 degrees off. Where the cloud does not fit in the end, the steps begin again. Pure:
-    works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field, the cloud and the prior;
-    see docs/poses.md.
+    Robust Gauss-Newton steps on the distances, in which outliers lose their weight. The pose may
+    be 15 cm and 6 degrees off. If the cloud does not fit after these steps, others start from
+    other poses. Pure: works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field, the
+    cloud and the prior; see docs/poses.md.
 
     Args:
         field: A map, a snapshot of one, or a baked field.
         cloud: (N, 3) m, sensor frame; rows with a NaN or inf are ignored.
-        pose: (4, 4) T_world_sensor, where to begin.
+        pose: (4, 4) T_world_sensor, the initial pose.
         prior: (mean, covariance): a pose (4, 4) and the covariance of its error (6, 6), as in
             `Registration`, such as that of odometry. Without one, directions that the cloud does
             not determine stay as in `pose`.
         noise: (a, b) of the standard deviation a + b r^2 of a return at range r, m and 1/m. By
             default it is `Config.range_noise` of the map; of a baked field, the default's.
-        reach_m: How far surfaces may be from where they should be, 0.001 to 100 m. The default
-            suits a map that is complete. In one that grows, a wrong surface may be nearer than one
-            that is missing: `track` takes 0.2. With a smaller reach outliers also lose their weight
-            sooner. Without a prior, a pose that ends farther from the given one, m or rad, has not
-            converged.
-        starts: Most poses to begin from, 1 to 5, not traced: the given one, and others 15 cm and 6
-            degrees away as long as the cloud does not fit; nearer ones with a smaller reach. With a
-            prior, at most two: both at the given pose, the second with less trust in the prior.
-            Take 1 to compare many poses: under `vmap` each takes as many starts as the worst one.
+        reach_m: Largest distance between a return and its surface at the initial pose, 0.001 to
+            100 m. The default suits a complete map. In a growing map the right surface may be
+            missing and a wrong one near: `track` takes 0.2. A smaller reach also removes the weight
+            of outliers sooner. Without a prior, a result farther from the initial pose than this,
+            m or rad, has not converged.
+        starts: Maximum number of initial poses, 1 to 5, not traced. The first is `pose`. While the
+            cloud does not fit, others follow, 15 cm and 6 degrees away, or nearer with a smaller
+            reach. With a prior there are at most two, both at `pose`, the second with less trust in
+            the prior. Pass 1 to compare many poses: under `vmap` each takes as many starts as the
+            worst one.
 
     Returns:
         The refined pose, and how far it can be trusted.
 
     Raises:
-        ValueError: A type or shape is wrong, or `starts` is no whole number from 1 to 5. Outside
+        ValueError: A type or shape is wrong, or `starts` is not a whole number from 1 to 5. Outside
             jit also: the pose or the prior's mean is not finite or not rigid, the prior's
             covariance is not symmetric and positive definite, the cloud has no finite row, or a
             value of `noise` or `reach_m` is out of range.
