@@ -16,7 +16,7 @@
 - `glitch`, `glitch left out`: five of them are off by 1 m, or those frames are missing
 - `drift`, `drift unrefined`: odometry that is too long by 1 % and turns by 0.05 degrees per meter
 - `drift known`: the same, and what they predict is a prior. Its standard deviations per axis are
-  1 % of the way and 0.2 degrees per meter
+  1 % of the distance traveled and 0.2 degrees per meter
 - `none`: only the first is used
 
 `--relocalize` searches random frames. `--mapped` maps only the first ones, and searches the others:
@@ -47,7 +47,7 @@ from hiosdf_jax._src.command.tracker import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.judging import LEAST_INLIERS
-from hiosdf_jax._src.mapping.registration.motion import way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.tracking import MOST_MOVED, prior_of_prediction
 
 MODES = (
@@ -63,8 +63,8 @@ MODES = (
     "drift known",
     "none",
 )
-DRIFT = 0.01, 0.05  # of the way, degrees per meter
-KNOWN_DRIFT = 0.01, 0.2  # standard deviations per axis: of the way, degrees per meter
+DRIFT = 0.01, 0.05  # of the distance traveled, degrees per meter
+KNOWN_DRIFT = 0.01, 0.2  # standard deviations per axis: of the distance, degrees per meter
 JITTER = 0.02, 1.0  # m, degrees
 JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 2 / 3)
 MAPPED_AGAIN = 3
@@ -214,7 +214,7 @@ def _refine_from(state, cloud, start):
     """Refines a pose as `track` does; returns it, and whether it is as near as `track` demands."""
     prior = prior_of_prediction(start, GROWING_REACH_M)
     found = hio.refine_pose(state, cloud, start, prior, reach_m=GROWING_REACH_M)
-    return found, max(way_and_angle(found.pose, start)) <= MOST_MOVED * GROWING_REACH_M
+    return found, max(distance_and_angle(found.pose, start)) <= MOST_MOVED * GROWING_REACH_M
 
 
 def print_relocalization(stream, frames, numbers, field, up_world):

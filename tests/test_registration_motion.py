@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hiosdf_jax._src.mapping.registration.motion import (
+    distance_and_angle,
     motion_between,
     move,
     rotation_of,
     vector_of,
-    way_and_angle,
 )
 
 ANGLES = [0.0, 1e-6, 9e-4, 1.1e-3, 0.1, 2.0, 3.0]
@@ -41,7 +41,7 @@ def test_poses_are_apart_by_a_way_and_an_angle(angle):
     first[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix()
     second[:3, :3] = Rotation.from_rotvec([0, angle, 0]).as_matrix() @ first[:3, :3]
     second[:3, 3] = [3, 0, 4]
-    np.testing.assert_allclose(way_and_angle(first, second), [5, angle], atol=1e-3)
+    np.testing.assert_allclose(distance_and_angle(first, second), [5, angle], atol=1e-3)
 
 
 @pytest.mark.parametrize("angle", ANGLES[:-1])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
-from hiosdf_jax._src.mapping.registration.motion import way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.tracking import (
     MOST_MOVED,
@@ -24,7 +24,7 @@ from hiosdf_jax._src.view.paths import save_paths
 
 TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")
 
-_LEAST_WAY_M = 0.05  # shorter ways drift as this one
+_LEAST_DISTANCE_M = 0.05  # shorter distances drift as this one does
 _LOST_FRAMES = 5  # a stream is lost if this many frames at its end do not fit
 
 
@@ -65,7 +65,7 @@ class Tracker:
 
         Args:
             odometry: Use no pose of the stream but the first.
-            drift: Standard deviations of the stream's motion: a share of the way, and degrees per
+            drift: Standard deviations of the motion: share of the distance, and degrees per
                 meter. Then predicted poses are priors. By default they are as exact as `track`
                 assumes.
         """
@@ -89,8 +89,8 @@ class Tracker:
         if self._drift is None or self._reference is None:
             return None
         share, degrees = self._drift
-        way_m = np.linalg.norm(predicted[:3, 3] - self._reference.pose[:3, 3])
-        deviation = max(float(way_m), _LEAST_WAY_M) * np.repeat([share, np.radians(degrees)], 3)
+        moved_m = float(np.linalg.norm(predicted[:3, 3] - self._reference.pose[:3, 3]))
+        deviation = max(moved_m, _LEAST_DISTANCE_M) * np.repeat([share, np.radians(degrees)], 3)
         return predicted, np.diag(deviation**2)
 
     def fuse(
@@ -108,7 +108,7 @@ class Tracker:
         predicted = self.predict(given)
         prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
         found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
-        moved = max(way_and_angle(found.pose, jnp.asarray(predicted)))
+        moved = max(distance_and_angle(found.pose, jnp.asarray(predicted)))
         near = found.converged & (moved <= MOST_MOVED * GROWING_REACH_M)
         return self._add(frame, given, predicted, found._replace(converged=near))
 

@@ -12,7 +12,7 @@ from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.equations import UNKNOWN_M
-from hiosdf_jax._src.mapping.registration.motion import way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
     checked_reach,
@@ -186,7 +186,7 @@ def _register(
 ) -> tuple[Registration, _Decision]:
     """Decides whether a cloud is fused, and where."""
     first = updates == 0
-    near = jnp.maximum(*way_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
+    near = jnp.maximum(*distance_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
     registered = found.converged & near & ~first
     # A young map may have too few surfaces to register a cloud, and would never get more.
     fused = registered | (updates < CONFIDENT_UPDATES)

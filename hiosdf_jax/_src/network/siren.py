@@ -108,12 +108,12 @@ def predict_with_gradient(
 @predict_with_gradient.defjvp
 @plain
 def _predict_with_gradient_jvp(config: Config, primals: Any, tangents: Any) -> Any:
-    def plain(params: Any, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def by_autodiff(params: Any, points: jax.Array) -> tuple[jax.Array, jax.Array]:
         return value_and_gradient(
             lambda x: jnp.asarray(network_of(config).apply(params, x)), points
         )
 
-    return jax.jvp(plain, primals, tangents)
+    return jax.jvp(by_autodiff, primals, tangents)
 
 
 def shift_output(config: Config, params: Any, amount: jax.Array) -> Any:

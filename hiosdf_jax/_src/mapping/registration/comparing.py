@@ -1,7 +1,7 @@
 """Returns compared with a map: rows, their residuals at a pose, and sums over them.
 
-Rotations are measured in meters, as the way of a return at the cloud's typical range. So all six
-components of a motion have one unit.
+Rotations are measured in meters, as the distance by which a return at the cloud's typical range
+moves. So all six components of a motion have one unit.
 """
 
 from __future__ import annotations
@@ -227,9 +227,9 @@ def _residuals_at(
     Returns:
         The residuals.
     """
-    turn, (scale_m, share, growing, length) = numbers[:12], numbers[12:]
-    offset = each(lambda row: dot(turn[row : row + 3], point), (0, 4, 8))
-    point_world = each(jnp.add, offset, turn[3::4])
+    transform, (scale_m, share, growing, length) = numbers[:12], numbers[12:]
+    offset = each(lambda row: dot(transform[row : row + 3], point), (0, 4, 8))
+    point_world = each(jnp.add, offset, transform[3::4])
     found = match(point_world, offset, growing, share)
     # Only the part of the error along the normal counts.
     square = jnp.maximum(dot(offset, offset), 1e-6)

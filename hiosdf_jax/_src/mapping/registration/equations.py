@@ -1,7 +1,7 @@
 """The weighted least-squares problem of a pose, linearized: directions, fits, steps.
 
-Rotations are measured in meters, as the way of a return at the cloud's typical range. So all six
-components of a motion have one unit, and directions can be compared.
+Rotations are measured in meters, as the distance by which a return at the cloud's typical range
+moves. So all six components of a motion have one unit, and directions can be compared.
 """
 
 from __future__ import annotations
@@ -129,26 +129,27 @@ def find_directions(
     mean = total[:, 1:] / jnp.maximum(count, 1e-9)
     information = jnp.matmul(mean.T, count * mean, precision="highest")
     basis = eigenvectors(information)
-    told = jnp.sum(basis * product(information, basis), axis=0)
+    determined = jnp.sum(basis * product(information, basis), axis=0)
 
     def growth(motion: jax.Array) -> jax.Array:
         there = compare(field, rows, move(pose, motion), 0.0)
-        # Returns that come to where the map ends tell nothing.
+        # Returns that move to where the map ends cannot be compared.
         both = here.comparable & there.comparable
         more = jnp.where(both, loss_of_distance(there) - loss_of_distance(here), 0)
         return jnp.sum(more) / jnp.maximum(jnp.sum(both), 1)
 
-    way = _TRIED_M * basis.T[:_TRIED_DIRECTIONS] / units(rows)
-    ways = jnp.concatenate([way, -way])
+    forward = _TRIED_M * basis.T[:_TRIED_DIRECTIONS] / units(rows)
+    both_ways = jnp.concatenate([forward, -forward])
     # All at once would need much memory where XLA makes arrays of all that leads to the losses.
     at_once = devices.has_kernels() and isinstance(field, Field)
-    grown = (jax.vmap(growth)(ways) if at_once else jax.lax.map(growth, ways)).reshape(2, -1)
+    grown = jax.vmap(growth)(both_ways) if at_once else jax.lax.map(growth, both_ways)
+    grown = grown.reshape(2, -1)
     least = _LEAST_GROWTH_BAKED if isinstance(field, Baked) else _LEAST_GROWTH
     number = np.arange(_TRIED_DIRECTIONS)
     by_one = number < _FREE_BY_ONE_SIDE
     free = ~(jnp.where(by_one, jnp.min(grown, axis=0), jnp.max(grown, axis=0)) >= least)
     free = jnp.concatenate([free, jnp.zeros(6 - _TRIED_DIRECTIONS, bool)])
-    free |= told < _LEAST_INFORMATION_SHARE * jnp.max(told)
+    free |= determined < _LEAST_INFORMATION_SHARE * jnp.max(determined)
     return Directions(basis, free | ~jnp.any(here.comparable))
 
 
@@ -186,8 +187,8 @@ def fits_better(one: Fit, other: Fit, least: jax.Array | float = 0.0) -> jax.Arr
     return jnp.where(jnp.isfinite(unknown), first < second - least, one.loss < other.loss)
 
 
-def turn(matrix: jax.Array, directions: Directions) -> jax.Array:
-    """Turns a matrix (6, 6) to the directions' basis, without what it has of free ones."""
+def in_basis(matrix: jax.Array, directions: Directions) -> jax.Array:
+    """Expresses a matrix (6, 6) in the basis of the directions, with zeros for free ones."""
     inside = product(directions.basis.T, product(matrix, directions.basis))
     bound = ~directions.free
     return jnp.where(bound[:, None] & bound, inside, 0)
@@ -222,7 +223,7 @@ def balance(
 
 def stiffness(information: jax.Array, directions: Directions | None, anchor: Anchor) -> jax.Array:
     """Computes the information of returns and anchor, (6, 6), in the directions' basis."""
-    own = information if directions is None else turn(information, directions)
+    own = information if directions is None else in_basis(information, directions)
     pull = _pull(directions, anchor)
     if pull is None:
         return own

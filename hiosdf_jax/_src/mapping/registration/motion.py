@@ -72,14 +72,14 @@ def motion_between(first: jax.Array, second: jax.Array) -> jax.Array:
     return jnp.concatenate([second[:3, 3] - first[:3, 3], vector])
 
 
-def way_and_angle(first: jax.Array, second: jax.Array) -> tuple[jax.Array, jax.Array]:
+def distance_and_angle(first: jax.Array, second: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Computes how far two poses (..., 4, 4) are apart, (...) m and rad, for turns up to pi.
 
     Angles below 1e-3 rad are lost to rounding; `motion_between` has them.
     """
-    way = jnp.linalg.norm(second[..., :3, 3] - first[..., :3, 3], axis=-1)
+    distance = jnp.linalg.norm(second[..., :3, 3] - first[..., :3, 3], axis=-1)
     cosine = (jnp.sum(first[..., :3, :3] * second[..., :3, :3], axis=(-2, -1)) - 1) / 2
-    return way, jnp.arccos(jnp.clip(cosine, -1, 1))
+    return distance, jnp.arccos(jnp.clip(cosine, -1, 1))
 
 
 def rotation_of(vector: jax.Array) -> jax.Array:

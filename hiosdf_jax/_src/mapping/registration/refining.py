@@ -20,7 +20,7 @@ from hiosdf_jax._src.mapping.registration.comparing import (
 from hiosdf_jax._src.mapping.registration.equations import Anchor, Directions, invert
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import least_range_of, noise_of
-from hiosdf_jax._src.mapping.registration.motion import way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.selection import (
     are_returns,
     draw_returns,
@@ -191,22 +191,24 @@ def _refine(
         symmetric = (covariance + covariance.T) / 2  # of which the inverse reads one half
         anchor = Anchor(mean, per_unit[:, None] * invert(symmetric) * per_unit)
 
-    still, frozen, held = jax.lax.stop_gradient((field, rows, anchor))
+    fixed_field, fixed_rows, fixed_anchor = jax.lax.stop_gradient((field, rows, anchor))
     begin, reach_m = jax.lax.stop_gradient((pose, reach_m))
-    near, share = solve_coarse(still, frozen, begin, held, reach_m, starts)
-    rows, frozen = rows._replace(share=share), frozen._replace(share=share)
-    index, chosen, directions = select_rows(still, frozen, near)
-    found, residuals, rests, inflation = solve_fine(still, chosen, near, directions, held)
-    covariance = covariance_of(residuals, directions, held, rows)
+    near, share = solve_coarse(fixed_field, fixed_rows, begin, fixed_anchor, reach_m, starts)
+    rows, fixed_rows = rows._replace(share=share), fixed_rows._replace(share=share)
+    index, chosen, directions = select_rows(fixed_field, fixed_rows, near)
+    found, residuals, rests, inflation = solve_fine(
+        fixed_field, chosen, near, directions, fixed_anchor
+    )
+    covariance = covariance_of(residuals, directions, fixed_anchor, rows)
 
-    verdict = judge(still, frozen, found)
+    verdict = judge(fixed_field, fixed_rows, found)
     usable = valid & is_rigid(found) & jnp.all(jnp.isfinite(covariance))
     if prior is None:
         # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
-        is_near = jnp.maximum(*way_and_angle(pose, found)) <= reach_m
+        is_near = jnp.maximum(*distance_and_angle(pose, found)) <= reach_m
     else:
         usable &= is_rigid(prior[0])
-        is_near = way_and_angle(prior[0], found)[1] <= _MOST_TURN_RAD
+        is_near = distance_and_angle(prior[0], found)[1] <= _MOST_TURN_RAD
     converged = rests & verdict.fits & usable & is_near
     own = take_rows(rows, index)._replace(share=chosen.share)
     # What is not finite would make derivatives NaN, although no such pose is chosen.

@@ -27,7 +27,7 @@ from hiosdf_jax._src.mapping.registration.comparing import (
 )
 from hiosdf_jax._src.mapping.registration.equations import Anchor
 from hiosdf_jax._src.mapping.registration.matching import least_range_of, noise_of
-from hiosdf_jax._src.mapping.registration.motion import rotation_of, way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import distance_and_angle, rotation_of
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.selection import draw_evenly, draw_returns
 from hiosdf_jax._src.mapping.registration.solving import COMPLETE_REACH_M, solve_coarse
@@ -63,7 +63,7 @@ class _Round(NamedTuple):
 
     one_in: int
     rows: int  # returns that score the copies
-    way_m: float  # standard deviations of what they are moved by
+    shift_m: float  # standard deviations of the random moves
     turn_rad: float
 
 
@@ -260,11 +260,11 @@ def _best(tried: _Upright, costs: jax.Array, count: int) -> _Upright:
 def _copy(tried: _Upright, a_round: _Round, key: jax.Array) -> _Upright:
     """Moves copies of hypotheses at random; the first copy stays, (N, COPIES, ...)."""
     count = len(tried.angle_rad)
-    way_key, turn_key = jax.random.split(key)
-    way = a_round.way_m * jax.random.normal(way_key, (count, _COPIES, 3), jnp.float32)
+    shift_key, turn_key = jax.random.split(key)
+    shift = a_round.shift_m * jax.random.normal(shift_key, (count, _COPIES, 3), jnp.float32)
     turn = a_round.turn_rad * jax.random.normal(turn_key, (count, _COPIES), jnp.float32)
     return _Upright(
-        tried.position_world[:, None] + way.at[:, 0].set(0),
+        tried.position_world[:, None] + shift.at[:, 0].set(0),
         tried.angle_rad[:, None] + turn.at[:, 0].set(0),
     )
 
@@ -383,5 +383,5 @@ def _score(field: Field | Baked, rows: Rows, pose: jax.Array) -> jax.Array:
 
 def _same_place(pose: jax.Array, poses: jax.Array) -> jax.Array:
     """Whether poses (N, 4, 4) are near one, (N,) bool; one that is not finite is nowhere."""
-    way, turn = way_and_angle(pose, poses)
-    return ~((way > _PLACE_M) | (turn > _PLACE_RAD))
+    distance, angle = distance_and_angle(pose, poses)
+    return ~((distance > _PLACE_M) | (angle > _PLACE_RAD))

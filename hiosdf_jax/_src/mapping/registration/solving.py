@@ -37,7 +37,7 @@ from hiosdf_jax._src.mapping.registration.equations import (
     fits_better,
 )
 from hiosdf_jax._src.mapping.registration.matching import share_of_map
-from hiosdf_jax._src.mapping.registration.motion import motion_between, move, way_and_angle
+from hiosdf_jax._src.mapping.registration.motion import distance_and_angle, motion_between, move
 from hiosdf_jax._src.mapping.registration.selection import draw_informative
 from hiosdf_jax._src.mapping.registration.uncertainty import inflation_of
 from hiosdf_jax._src.numerics.barriers import compute_once
@@ -61,12 +61,12 @@ _LEAST_KNOWN = 0.3  # share of the returns about which the map must tell somethi
 # Then the steps begin again, this far from the given pose, m and rad, in directions to the corners
 # of tetrahedra. Of 210 poses in the apartment, 15 cm and 6 degrees off, one start loses 7, and five
 # lose none.
-_OTHER_WAY_M = 0.15
+_OTHER_DISTANCE_M = 0.15
 _OTHER_ANGLE_RAD = 0.105
 _CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-_FARTHEST = 2.0  # times that way and angle: other starts that end farther off are not kept
+_FARTHEST = 2.0  # times that distance and angle: other starts that end farther off are not kept
 _OTHER_STARTS = np.concatenate(
-    [_OTHER_WAY_M * _CORNERS, _OTHER_ANGLE_RAD * np.roll(-_CORNERS, 1, axis=0)], axis=1
+    [_OTHER_DISTANCE_M * _CORNERS, _OTHER_ANGLE_RAD * np.roll(-_CORNERS, 1, axis=0)], axis=1
 ).astype(np.float32)
 
 # This many returns count as one independent return. Against a prior, coarse steps must not trust
@@ -161,12 +161,12 @@ def solve_coarse(
         scale_m = reach_m * shrink ** (jnp.float32(i) / (_COARSE_STEPS - 1))
         # The first step takes planes, which narrow patches have, too.
         sums = sum_returns(field, few._replace(share=before.share), pose, scale_m)
-        held = anchor
-        if held.information is not None:
+        softer = anchor
+        if softer.information is not None:
             lower = jnp.where(number > 0, 1 + (scale_m / _COARSE_SIGMA_M) ** 2, 1)
-            held = held._replace(information=held.information / lower)
+            softer = softer._replace(information=softer.information / lower)
         # Fine steps bring free directions back.
-        motion = find_step(sums, None, held, few, pose, _COARSE_INFLATION, _DAMPING)
+        motion = find_step(sums, None, softer, few, pose, _COARSE_INFLATION, _DAMPING)
         return move(pose, motion), sums
 
     def begin(carry: tuple[Any, Fit, jax.Array]) -> tuple[Any, Fit, jax.Array]:
@@ -177,9 +177,9 @@ def solve_coarse(
         )
         fit = fit_of(sums, few.some)
         if anchor.information is None:
-            way, angle = way_and_angle(pose, found)
+            distance, angle = distance_and_angle(pose, found)
             most = _FARTHEST * size
-            near = (way <= most * _OTHER_WAY_M) & (angle <= most * _OTHER_ANGLE_RAD)
+            near = (distance <= most * _OTHER_DISTANCE_M) & (angle <= most * _OTHER_ANGLE_RAD)
         else:
             away = units(few) * motion_between(anchor.pose, found)
             near = jnp.sum(away * product(anchor.information, away)) <= _MOST_DEVIATIONS**2
@@ -242,8 +242,8 @@ def _most_informative(residuals: Residuals, rows: Rows, directions: Directions) 
         return whole
     information = information_of(residuals)
     # Free directions must not draw all rows.
-    held = jnp.where(directions.free, jnp.trace(information), 0)
-    information += product(directions.basis * held, directions.basis.T)
+    stiffness = jnp.where(directions.free, jnp.trace(information), 0)
+    information += product(directions.basis * stiffness, directions.basis.T)
     information += 1e-9 * (1 + jnp.trace(information)) * jnp.eye(6, dtype=jnp.float32)
     row = draw_informative(residuals.jacobian, residuals.weight, information, _FINE_ROWS)
     # A small cloud that is padded gives the same pose as without padding.
@@ -314,16 +314,16 @@ class _Progress(NamedTuple):
 
     Attributes:
         pose: (4, 4).
-        way: Length of the last whole step, () m; infinite as long as there is a tolerance.
-        total: Sum of the whole steps since it was last asked whether the pose rests, (6,).
-        longest: Length of the longest of these steps, () m.
+        last_m: Length of the last whole step, () m; infinite as long as there is a tolerance.
+        total: Sum of the whole steps since the last check for rest, (6,).
+        longest_m: Length of the longest of these steps, () m.
         count: Number of steps, () int32.
     """
 
     pose: jax.Array
-    way: jax.Array
+    last_m: jax.Array
     total: jax.Array
-    longest: jax.Array
+    longest_m: jax.Array
     count: jax.Array
 
 
@@ -343,7 +343,7 @@ def _rest(
     """
     nothing = jnp.zeros(6, jnp.float32)
 
-    def way_of(motion: jax.Array) -> jax.Array:
+    def length_m(motion: jax.Array) -> jax.Array:
         return jnp.linalg.norm(motion[:3]) + rows.length * jnp.linalg.norm(motion[3:])
 
     def step(_: jax.Array, now: _Progress) -> _Progress:
@@ -351,29 +351,29 @@ def _rest(
         sums = sum_returns(field, rows, now.pose, jnp.where(scale_m > _FINE_END_M, scale_m, 0))
         motion = find_step(sums, directions, anchor, rows, now.pose, inflation)
         part = 1 / jnp.maximum(now.count - _WHOLE_STEPS + 2, 1).astype(jnp.float32)
-        way = way_of(motion)
+        step_m = length_m(motion)
         return _Progress(
             pose=move(now.pose, part * motion),
             # Exact comparisons alone say whether a pose rests.
-            way=jnp.where(scale_m > _FINE_END_M, jnp.inf, way),
+            last_m=jnp.where(scale_m > _FINE_END_M, jnp.inf, step_m),
             total=now.total + motion,
-            longest=jnp.maximum(now.longest, way),
+            longest_m=jnp.maximum(now.longest_m, step_m),
             count=now.count + 1,
         )
 
     def steps(now: _Progress) -> _Progress:
-        now = now._replace(total=nothing, longest=jnp.float32(0))
+        now = now._replace(total=nothing, longest_m=jnp.float32(0))
         return jax.lax.fori_loop(
             0, _STEPS_AT_ONCE, step, now, unroll=rounds_per_step(_STEPS_AT_ONCE)
         )
 
     def continues(now: _Progress) -> jax.Array:
-        return (now.count < _FINE_STEPS) & (now.way > _FINISHED_M)
+        return (now.count < _FINE_STEPS) & (now.last_m > _FINISHED_M)
 
     start = _Progress(pose, jnp.float32(jnp.inf), nothing, jnp.float32(0), jnp.int32(0))
     end = jax.lax.while_loop(continues, steps, start)
-    slow = way_of(end.total) <= _STEPS_AT_ONCE * _RESTING_M
-    return end.pose, (end.way <= _FINISHED_M) | (slow & (end.longest <= _LONGEST_JUMP_M))
+    slow = length_m(end.total) <= _STEPS_AT_ONCE * _RESTING_M
+    return end.pose, (end.last_m <= _FINISHED_M) | (slow & (end.longest_m <= _LONGEST_JUMP_M))
 
 
 @jax.custom_jvp

@@ -17,10 +17,10 @@ from hiosdf_jax._src.mapping.registration.equations import (
     UNKNOWN_M,
     Anchor,
     Directions,
+    in_basis,
     invert,
     sizes,
     sum_in_cells,
-    turn,
 )
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
 
@@ -51,8 +51,8 @@ def spread_of_slope(residuals: Residuals) -> jax.Array:
 
 def inflation_of(residuals: Residuals, directions: Directions) -> jax.Array:
     """Computes how many returns tell as much as one independent one would, at least 1."""
-    spread = jnp.diag(turn(spread_of_slope(residuals), directions))
-    information = jnp.diag(turn(information_of(residuals), directions))
+    spread = jnp.diag(in_basis(spread_of_slope(residuals), directions))
+    information = jnp.diag(in_basis(information_of(residuals), directions))
     ratio = spread / jnp.maximum(information, 1e-30)
     return jnp.maximum(jnp.sum(ratio) / jnp.maximum(jnp.sum(~directions.free), 1), 1)
 
@@ -72,7 +72,7 @@ def covariance_of(
         (6, 6) m and rad. A free direction without a prior has a standard deviation of 100 m.
     """
     free = jnp.diag(directions.free.astype(jnp.float32))
-    independent = invert(turn(information_of(residuals), directions) + free) - free
+    independent = invert(in_basis(information_of(residuals), directions) + free) - free
     # At least that of independent returns: a few cells may agree by chance.
     own = _jackknife(residuals, directions, rows) + independent + UNKNOWN_M**2 * free
     if anchor.information is not None:
