@@ -1,6 +1,7 @@
 """Runs of the command that refine the poses of a stream, or use none of them."""
 
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -130,7 +131,7 @@ def test_a_frame_of_another_place_is_left_out(tmp_path, quick):
         assert way_cm(file["poses"], exact).max() < 3
     metrics = json.loads((output / "metrics.json").read_text("utf-8"))
     assert metrics["updates"] == FRAMES - 1
-    assert metrics["flags"] == ["NOT_REGISTERED"]
+    assert metrics["flags"] == ["NOT_REGISTERED", "FUSED_AS_PREDICTED"]
 
 
 @pytest.mark.parametrize("option", ["--refine-poses", "--odometry"])
@@ -147,7 +148,8 @@ def test_the_prior_of_a_drift_grows_with_the_way(monkeypatch):
     def note(state, cloud, predicted, prior):
         priors.append(prior)
         zero = jnp.float32(0)
-        return state, Registration(predicted, jnp.eye(6), zero, zero, jnp.asarray(True))
+        found = Registration(predicted, jnp.eye(6), zero, zero, jnp.asarray(True))
+        return SimpleNamespace(updates=state.updates + 1), found
 
     monkeypatch.setattr(tracker, "track", note)
     tracked: Any = tracker.Tracker(odometry=False, drift=(0.01, 0.2))
@@ -155,7 +157,7 @@ def test_the_prior_of_a_drift_grows_with_the_way(monkeypatch):
     given[:, 0, 3] = [0, 0, 0.02, 0.52]
     given[3, :3, :3] = Rotation.from_euler("z", 0.3).as_matrix()
     for i, pose in enumerate(given):
-        tracked.fuse(None, None, pose, i)
+        tracked.fuse(SimpleNamespace(updates=i), None, pose, i)
     assert priors[0] is None
     for (mean, covariance), pose, way_m in zip(
         priors[1:], given[1:], (0.05, 0.05, 0.5), strict=True

@@ -85,10 +85,15 @@ def test_the_first_frame_is_fused_as_predicted(empty_map):
 
 def test_a_young_map_takes_what_it_cannot_judge(empty_map):
     state = empty_map
-    for k in range(6):
+    unknown = 100**2 * np.eye(6)
+    flags = [hio.Flag(0), *4 * [hio.Flag.FUSED_AS_PREDICTED], hio.Flag.NOT_REGISTERED]
+    for k, flag in enumerate(flags):
         state, found = hio.track(state, foreign(), np.eye(4))
-        assert bool(found.converged) == (k < 5)
+        assert bool(found.converged) == (k == 0)
+        np.testing.assert_allclose(found.covariance, unknown if k else 0 * unknown)
+        assert hio.Flag(int(state.report.update_flags)) & ~hio.Flag.POINTS_OUTSIDE == flag
     assert int(state.updates) == 5
+    assert hio.Flag.FUSED_AS_PREDICTED in hio.Flag(int(state.report.flags))
 
 
 def test_a_young_map_takes_no_cloud_that_update_refuses(empty_map):

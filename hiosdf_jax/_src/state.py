@@ -67,6 +67,8 @@ class Flag(enum.IntFlag):
     else."""
     NOT_REGISTERED = 128
     """`track` found no pose at which the cloud fits the map. It was not fused."""
+    FUSED_AS_PREDICTED = 256
+    """`track` fused the cloud at its predicted pose: the map was too young to register it."""
 
     def __str__(self) -> str:
         """Returns the names of the flags with `|` between them, or "none"."""

@@ -26,6 +26,7 @@ FLAG_WORDS = {
     Flag.INCONSISTENT_CLOUD: "a cloud contradicted the map: check the pose and the sensor",
     Flag.BAD_ARGUMENT: "the robot's spheres or the noise had bad values",
     Flag.NOT_REGISTERED: "a cloud did not fit the map at any pose near its own, and was left out",
+    Flag.FUSED_AS_PREDICTED: "a cloud of the young map was fused at its own pose",
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -98,8 +98,9 @@ class Tracker:
     ) -> tuple[MapState, np.ndarray]:
         """Registers a frame and fuses it if it fits; returns the map and the pose (4, 4)."""
         predicted = self.predict(given)
+        updates = int(state.updates)
         state, found = track(state, cloud, predicted, self.prior_of(predicted))
-        return state, self._add(frame, given, predicted, found)
+        return state, self._add(frame, given, found, int(state.updates) > updates)
 
     def locate(
         self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
@@ -109,8 +110,10 @@ class Tracker:
         prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
         found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
         moved = max(distance_and_angle(found.pose, jnp.asarray(predicted)))
-        near = found.converged & (moved <= MOST_MOVED * GROWING_REACH_M)
-        return self._add(frame, given, predicted, found._replace(converged=near))
+        near = bool(found.converged) and moved <= MOST_MOVED * GROWING_REACH_M
+        if not near:
+            found = found._replace(pose=predicted, converged=jnp.asarray(False))
+        return self._add(frame, given, found, near)
 
     def counts(self) -> dict[str, int | None]:
         """How the frames fit the map, by the keys of `metrics.json`.
@@ -159,15 +162,9 @@ class Tracker:
             up_world,
         )
 
-    def _add(
-        self, frame: int, given: np.ndarray, predicted: np.ndarray, found: Registration
-    ) -> np.ndarray:
-        fused = bool(found.converged)
-        pose: Any = np.asarray(found.pose if fused else predicted)
-        # A pose that was refined differs from its prediction, if only in its last digits.
-        registered = fused and (not self.frames or not np.array_equal(pose, predicted))
-        covariance = np.asarray(found.covariance)
-        tracked = Tracked(frame, given, pose, covariance, registered, fused)
+    def _add(self, frame: int, given: np.ndarray, found: Registration, fused: bool) -> np.ndarray:
+        pose, covariance = np.asarray(found.pose), np.asarray(found.covariance)
+        tracked = Tracked(frame, given, pose, covariance, bool(found.converged), fused)
         self.frames.append(tracked)
         if fused:
             self._reference = tracked

@@ -22,7 +22,7 @@ from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.state import Flag, MapState, check_map
+from hiosdf_jax._src.state import Flag, MapState, Report, check_map
 
 MOST_MOVED = 2.0
 """How far a pose may be moved from its prediction, as a share of `reach_m`, m and rad."""
@@ -45,7 +45,8 @@ def track(
 
     It is `refine_pose` and then `update`. A cloud that fits at no pose near the predicted one is
     not fused: the map stays as it was, and `Flag.NOT_REGISTERED` is raised. The first cloud of a
-    map is fused where it is predicted, and so are those of the first five updates that do not fit.
+    map is fused where it is predicted. So are those of the next four updates that do not fit, since
+    a young map cannot judge them; they raise `Flag.FUSED_AS_PREDICTED`.
     Pure: works inside `jit`, `vmap` and `lax.scan`.
 
     Args:
@@ -61,11 +62,10 @@ def track(
             m or rad, is refused.
 
     Returns:
-        The new map, and the registration. `converged` is False if the cloud fits nowhere, or if
-        `update` refuses it during the first five updates, for instance because the predicted pose
-        is not finite. Then the pose is the predicted one, and the covariance that of the prior, or
-        100 m. The covariance of the first cloud is that of the prior, or 0: its pose defines where
-        the map is.
+        The new map, and the registration. `converged` is False if the map did not determine the
+        pose, even where the cloud was fused as predicted. Then the pose is the predicted one, and
+        the covariance that of the prior, or 100 m. The first cloud defines where the map is: if
+        `update` takes it, `converged` is True, and the covariance that of the prior, or 0.
 
     Raises:
         ValueError: As `refine_pose` and `update` do.
@@ -97,8 +97,9 @@ def track(
     extras, donate = (None, checked_noise), donate and not traced
     state = run_update(state, fused_cloud, found.pose, extras, decision.flags, donate)
     # `update` may refuse what a young map takes on trust.
-    converged, covariance = _confirm_jit(found, decision, state.updates, own)
-    return state, found._replace(converged=converged, covariance=covariance)
+    report, converged, covariance = _confirm_jit(found, decision, state.report, state.updates, own)
+    found = found._replace(converged=converged, covariance=covariance)
+    return state.replace(report=report), found
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
@@ -167,11 +168,13 @@ class _Decision(NamedTuple):
 
     Attributes:
         registered: The map determined the pose, () bool.
+        as_predicted: The cloud is fused although it did not, () bool.
         updates_if_fused: Number of updates after the cloud is fused, () int32.
         flags: Flags of `Flag` that this raises, () uint32.
     """
 
     registered: jax.Array
+    as_predicted: jax.Array
     updates_if_fused: jax.Array
     flags: jax.Array
 
@@ -195,10 +198,9 @@ def _register(
     chosen = found._replace(
         pose=jnp.where(registered, found.pose, predicted),
         covariance=jnp.where(registered, found.covariance, own),
-        converged=fused,
     )
     flags = jnp.where(fused, 0, Flag.NOT_REGISTERED).astype(jnp.uint32)
-    return chosen, _Decision(registered, updates + 1, flags)
+    return chosen, _Decision(registered, fused & ~registered, updates + 1, flags)
 
 
 _register_jit = jax.jit(_register)
@@ -206,12 +208,20 @@ _register_jit = jax.jit(_register)
 
 @jax.jit
 def _confirm_jit(
-    found: Registration, decision: _Decision, updates: jax.Array, own: jax.Array | None
-) -> tuple[jax.Array, jax.Array]:
-    """Returns whether a cloud was registered or fused after all, and the covariance of its pose."""
-    converged = decision.registered | (found.converged & (updates == decision.updates_if_fused))
+    found: Registration,
+    decision: _Decision,
+    report: Report,
+    updates: jax.Array,
+    own: jax.Array | None,
+) -> tuple[Report, jax.Array, jax.Array]:
+    """Returns the report, whether a cloud was registered, and the covariance of its pose."""
+    first = decision.updates_if_fused == 1
+    as_predicted = decision.as_predicted & (updates == decision.updates_if_fused)
+    flag = jnp.where(as_predicted & ~first, Flag.FUSED_AS_PREDICTED, 0).astype(jnp.uint32)
+    report = report.replace(update_flags=report.update_flags | flag, flags=report.flags | flag)
+    converged = decision.registered | (as_predicted & first)
     other = _unknown() if own is None else own
-    return converged, jnp.where(converged, found.covariance, other)
+    return report, converged, jnp.where(converged, found.covariance, other)
 
 
 def _unknown() -> jax.Array:
