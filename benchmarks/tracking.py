@@ -24,7 +24,7 @@ some of them are at places that the map does not know. `--map` takes a saved map
 another place. It prints how many right and wrong places have converged, and how many of these are
 sure: `score` exceeds `other_score` by more than 0.1.
 
-`--wrong-poses` refines each third frame from poses that are 1 m off, in the map before it.
+`--wrong-poses` refines each third frame from poses that are 0.5 and 1 m off, in the map before it.
 
 `--stream demo` is the apartment; 240 frames are 10 Hz at 1 m/s. `--kiss-icp` measures the odometry
 of KISS-ICP on the same clouds beside; it needs `pip install kiss-icp`.
@@ -70,8 +70,12 @@ JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 
 MAPPED_AGAIN = 3
 GLITCH = range(60, 65)
 
-# A pose is wrong if it is farther than this from the right one, m.
+# A pose is wrong if it is farther than this from the right one, m. Tried are these shifts, m.
 WRONG_M = 0.3
+SHIFTS_M = {
+    1.0: ((0.6, 0.8, 0), (-0.6, -0.8, 0), (0.8, -0.6, 0), (-0.8, 0.6, 0)),
+    0.5: ((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)),
+}
 
 # A frame counts as found within this, m and degrees. A place is sure if its margin is larger.
 FOUND = 0.05, 1.0
@@ -189,25 +193,28 @@ def print_tracking(stream, frames, config, truth, mode, seed):
 def print_wrong_poses(stream, frames, config):
     """Prints how many wrong poses pass as right ones, and how many right ones are refused."""
     state = hio.init(config, jax.random.key(0))
-    tried = by_inliers = taken = right = refused = 0
+    right = refused = 0
+    counts = {distance_m: np.zeros(3, int) for distance_m in SHIFTS_M}
     for i, (cloud, pose) in enumerate(frames):
         if i >= 6 and i % 3 == 0:
             found, near = _refine_from(state, cloud, pose)
             right += 1
             refused += not (near and bool(found.converged))
-            for way in ([0.6, 0.8, 0], [-0.6, -0.8, 0], [0.8, -0.6, 0], [-0.8, 0.6, 0]):
-                start = np.array(pose)
-                start[:3, 3] += way
-                found, near = _refine_from(state, cloud, start)
-                near &= np.linalg.norm(error(found.pose, pose)[:3]) >= WRONG_M
-                tried += 1
-                by_inliers += near and float(found.inliers) >= LEAST_INLIERS
-                taken += near and bool(found.converged)
+            for distance_m, shifts in SHIFTS_M.items():
+                for shift in shifts:
+                    start = np.array(pose)
+                    start[:3, 3] += shift
+                    found, near = _refine_from(state, cloud, start)
+                    near &= np.linalg.norm(error(found.pose, pose)[:3]) >= WRONG_M
+                    fits = float(found.inliers) >= LEAST_INLIERS, bool(found.converged)
+                    counts[distance_m] += [True, near and fits[0], near and fits[1]]
         state = hio.update(state, cloud, pose)
-    print(
-        f"{stream}: of {tried} poses that were 1 m off, {by_inliers} wrong ones have enough "
-        f"inliers, and {taken} are taken; of {right} right ones {refused} are refused"
-    )
+    for distance_m, (tried, by_inliers, taken) in counts.items():
+        print(
+            f"{stream}: of {tried} poses that were {distance_m:g} m off, {by_inliers} wrong ones "
+            f"have enough inliers, and {taken} are taken"
+        )
+    print(f"{stream}: of {right} right ones {refused} are refused")
 
 
 def _refine_from(state, cloud, start):

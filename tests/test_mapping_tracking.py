@@ -60,6 +60,16 @@ def test_a_frame_of_another_place_changes_nothing_but_the_flags(sharp_map):
     assert arrays_equal(same, sharp_map)
 
 
+@pytest.mark.parametrize("shift", [(0.5, 0, 0), (-0.5, 0, 0), (0.3, 0.3, 0), (-0.7, 0, 0)])
+def test_a_prediction_whose_rays_go_through_a_wall_is_refused(sharp_map, shift):
+    """Most returns fit: those on the walls along the shift, the floor and the ceiling."""
+    cloud, pose = room_cloud(100, COUNT)
+    state, found = hio.track(sharp_map, cloud, moved(pose, shift, np.zeros(3)))
+    assert float(found.inliers) > 0.7
+    assert not bool(found.converged)
+    assert int(state.updates) == int(sharp_map.updates)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_few_returns_correct_a_prediction_that_is_three_deviations_off(sharp_map, seed):
     cloud, pose = room_cloud(100 + seed, 20 * COUNT, 0.3, (0.1, 0.05, 0.0))
