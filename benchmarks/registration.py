@@ -37,13 +37,13 @@ POINTS_OF_HYPOTHESES = 256
 REPEATS = 20
 
 
-def perturb(pose, rng, way_m, angle_deg):
-    """Moves a pose by a given way and angle, in random directions."""
-    way, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+def perturb(pose, rng, distance_m, angle_deg):
+    """Moves a pose by a given distance and angle, in random directions."""
+    direction, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     result = np.array(pose, float)
     turn = Rotation.from_rotvec(np.radians(angle_deg) * axis).as_matrix()
     result[:3, :3] = turn @ result[:3, :3]
-    result[:3, 3] += way_m * way
+    result[:3, 3] += distance_m * direction
     return result.astype(np.float32)
 
 
@@ -77,13 +77,13 @@ def make_map(stream, held_out, config_name):
     return state
 
 
-def print_case(field, frames, way_m, angle_deg, tries):
+def print_case(field, frames, distance_m, angle_deg, tries):
     """Refines perturbed poses of all frames and prints a row of the table."""
     rng = np.random.default_rng(0)
     errors, squares, seconds, converged = [], [], [], []
     for cloud, pose in frames:
-        for _ in range(tries if way_m else 1):
-            start = perturb(pose, rng, way_m, angle_deg)
+        for _ in range(tries if distance_m else 1):
+            start = perturb(pose, rng, distance_m, angle_deg)
             begin = time.perf_counter()
             found = jax.block_until_ready(hio.refine_pose(field, cloud, start))
             seconds.append(time.perf_counter() - begin)
@@ -91,14 +91,14 @@ def print_case(field, frames, way_m, angle_deg, tries):
             errors.append([100 * np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))])
             squares.append(away @ np.linalg.solve(np.asarray(found.covariance, float), away))
             converged.append(bool(found.converged))
-    way, angle = np.transpose(errors)
-    far = way > FAR_CM
+    distance, angle = np.transpose(errors)
+    far = distance > FAR_CM
     print(
-        f"| {100 * way_m:g} cm, {angle_deg:g} deg | {len(way)} | {np.median(way):.2f} | "
-        f"{np.percentile(way, 95):.2f} | {way.max():.2f} | {np.median(angle):.3f} | "
-        f"{np.percentile(angle, 95):.3f} | {np.mean(squares):.1f} | {np.mean(converged):.2f} | "
+        f"| {100 * distance_m:g} cm, {angle_deg:g} deg | {len(distance)} | "
+        f"{np.median(distance):.2f} | {np.percentile(distance, 95):.2f} | {distance.max():.2f} | "
+        f"{np.median(angle):.3f} | {np.percentile(angle, 95):.3f} | {np.mean(squares):.1f} | {np.mean(converged):.2f} | "
         f"{np.sum(~far)} | {np.sum(far & converged)} | "
-        f"{1e3 * np.median(seconds[1:]):.0f} |",
+        f"{1e3 * np.median(seconds[1:]):.3g} |",
         flush=True,
     )
 
@@ -117,8 +117,8 @@ def median_ms(function, arguments):
 def print_hypotheses(field, cloud, pose, count):
     """Times one refinement inside `jit`, and many poses at once by few returns."""
     rng = np.random.default_rng(0)
-    way_m, angle_deg = CASES[1]
-    starts = np.stack([perturb(pose, rng, way_m, angle_deg) for _ in range(count)])
+    distance_m, angle_deg = CASES[1]
+    starts = np.stack([perturb(pose, rng, distance_m, angle_deg) for _ in range(count)])
     whole = jax.device_put(np.asarray(cloud, np.float32))
     one = median_ms(jax.jit(hio.refine_pose), (field, whole, starts[0]))
     print(f"one pose inside jit, {len(cloud)} points: {one:.2f} ms")
@@ -143,9 +143,9 @@ def main():
     arguments = parser.parse_args()
     if arguments.between and arguments.stream:
         parser.error("--between is for the demo, without --stream")
-    stream = demo.ApartmentStream(80)
-    if arguments.stream:
-        stream = datasets.open_stream(arguments.stream)
+    stream = (
+        datasets.open_stream(arguments.stream) if arguments.stream else demo.ApartmentStream(80)
+    )
     held_out = held_out_frames(len(stream))
     if arguments.map:
         state = hio.load(arguments.map)
@@ -164,8 +164,8 @@ def main():
         " normalized square, 6 expected | converged | within 3 cm | of the others converged | ms |"
     )
     print("| --- " * 12 + "|")
-    for way_m, angle_deg in (OCCLUDED_CASE,) if arguments.occluded else CASES:
-        print_case(field, frames, way_m, angle_deg, arguments.tries)
+    for distance_m, angle_deg in (OCCLUDED_CASE,) if arguments.occluded else CASES:
+        print_case(field, frames, distance_m, angle_deg, arguments.tries)
     rng = np.random.default_rng(1)
     foreign = [rng.uniform(-3, 3, (20_000, 3)).astype(np.float32), 0.6 * frames[0][0]]
     for cloud, name in zip(foreign, ("random points", "a view scaled by 0.6"), strict=True):
