@@ -187,9 +187,15 @@ def test_map_corrections_above_the_odometry(tmp_path):
         open_stream(bag.path)[2][1], correction @ motion(STAMPS[2]) @ MOUNT, atol=1e-5
     )
     check_stream(open_stream(bag.path, world_frame="odom"))
-    check_stream(open_stream(path, world_frame="odom"))
-    with pytest.raises(ValueError, match="frame 'earth' is not above 'lidar'"):
-        open_stream(path, world_frame="earth")
+    for name in ("odom", "/odom"):
+        check_stream(open_stream(path, world_frame=name))
+    for name, message in (
+        ("earth", "frame 'earth' is not above 'lidar', expected one of"),
+        ("lidar", "world_frame = 'lidar', which is the clouds' own and moves; expected one of"),
+        (5, "world_frame is 5, expected a frame's name"),
+    ):
+        with pytest.raises(ValueError, match=f"{re.escape(str(path))}: {message}"):
+            open_stream(path, world_frame=name)
     _, pose = open_stream(path, world_frame="base")[0]
     np.testing.assert_allclose(pose, MOUNT, atol=1e-6)
 
@@ -304,6 +310,52 @@ def test_clouds_recorded_at_the_same_time(tmp_path):
     for i in range(5):
         np.testing.assert_array_equal(stream[i][0], CLOUDS[i])
         np.testing.assert_allclose(stream[i][1], motion(STAMPS[i]), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ("lidar2", "in frame 'lidar2', which has no transform up to the frame of the map, 'odom'"),
+        ("odom", "in frame 'odom', which has no transform up to"),
+        ("mirror", r"mirror in mast: frame 'odom' is not above 'mirror', expected one of \['mast'"),
+        ("rear", None),
+    ],
+)
+def test_later_clouds_in_other_frames(tmp_path, frame, message):
+    with Bag(tmp_path / "drive", "mcap") as bag:
+        bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        bag.write_transform(START, "base", "rear", TURNED, "/tf_static")
+        bag.write_transform(START, "mast", "mirror", MOUNT, "/tf_static")
+        for time in np.arange(START, START + 1, 0.07):
+            bag.write_transform(time, "odom", "base", motion(time))
+        bag.write_cloud(STAMPS[0], CLOUDS[0])
+        bag.write_cloud(STAMPS[1], CLOUDS[1], frame)
+    stream = open_stream(bag.path)
+    np.testing.assert_allclose(stream[0][1], motion(STAMPS[0]) @ MOUNT, atol=2e-6)
+    if message is None:
+        np.testing.assert_allclose(stream[1][1], motion(STAMPS[1]) @ TURNED, atol=2e-6)
+    else:
+        with pytest.raises(
+            BadFrameError, match=f"frame 1: {re.escape(str(bag.path))}, .*{message}"
+        ):
+            read_frame(stream, 1)
+
+
+def test_a_transform_has_one_pose_at_a_time(tmp_path):
+    with Bag(tmp_path / "drive", "mcap") as bag:
+        bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        for time in np.repeat(np.arange(START, START + 1, 0.07), 2):
+            bag.write_transform(time, "odom", "base", motion(time))  # twice the same
+            bag.write_transform(START, "base", "wheel", motion(time))  # not on the way up
+        bag.write_transform(START, "map", "odom", np.eye(4))
+        bag.write_transform(START, "map", "odom", MOUNT)
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud)
+    with pytest.raises(
+        ValueError, match=r"drive, odom in map, at 1700000000\.0+ s: another pose at 1700000000\."
+    ):
+        open_stream(bag.path)
+    check_stream(open_stream(bag.path, world_frame="odom"))
 
 
 def test_frames_without_a_transform(tmp_path):

@@ -25,7 +25,7 @@ import numpy as np
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 from hiosdf_jax._src.datasets.inflating import limit_rosbags
 from hiosdf_jax._src.datasets.stream import FrameStream
-from hiosdf_jax._src.datasets.timed_poses import TimedPoses
+from hiosdf_jax._src.datasets.timed_poses import TimedPoses, check_unique
 from hiosdf_jax._src.datasets.transforms import Edge, moves, moving, path_up, transform_up
 
 if TYPE_CHECKING:
@@ -57,13 +57,14 @@ def rosbag_stream(
         world_frame: Frame of the map; by default the root of the tf tree.
 
     Returns:
-        The clouds as a stream. A cloud without transforms at its time is a bad frame. The bag
-        stays open for the lifetime of the stream.
+        The clouds as a stream. A cloud without transforms at its time, or in a frame that has
+        none, is a bad frame. The bag stays open for the lifetime of the stream.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The bag cannot be read, a topic is missing or ambiguous, the bag does not
-            contain the motion of the sensor, or tf and odometry may both be that motion.
+            contain the motion of the sensor, tf and odometry may both be that motion, or a
+            transform has two poses at one time.
         ModuleNotFoundError: rosbags is not installed.
 
     Example:
@@ -96,31 +97,8 @@ def rosbag_stream(
             times, transforms, odometry, first = _scan(reader, clouds)
         if first is None:
             raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message, expected clouds")
-        edges = _edges(path, transforms)
         sensor = _name(first.header.frame_id)
-        if odometry_topic is None:
-            odometry_topic = _default_odometry(path, edges, odometry, sensor, world_frame)
-        if odometry_topic is not None:
-            if odometry_topic not in odometry:
-                raise ValueError(
-                    f"{path}: odometry_topic = {odometry_topic!r}, expected one of "
-                    f"{sorted(odometry)}"
-                )
-            moved = _edges(path, odometry[odometry_topic])
-            edges |= moved
-            if moved.keys().isdisjoint(path_up(edges, sensor)):
-                raise ValueError(
-                    f"{path}: odometry topic {odometry_topic} moves {list(moved)}, expected one of "
-                    f"{path_up(edges, sensor)}, the frames from the cloud's frame upward"
-                )
-        above = path_up(edges, sensor, world_frame)
-        # Odometry may say that the robot stands still.
-        if world_frame is None and odometry_topic is None and not moving(edges, above):
-            raise ValueError(
-                f"{path}: nothing moves above the cloud's frame, {' in '.join(above)}; expected "
-                f"tf, or one of the odometry topics {sorted(odometry)} whose child is one of these "
-                "frames, or a world_frame if the sensor stands still"
-            )
+        edges, above = _tree(path, transforms, odometry, sensor, odometry_topic, world_frame)
         kept_open = closing.pop_all()
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -133,8 +111,18 @@ def rosbag_stream(
             if returns > most:
                 raise ValueError(f"{returns} returns, expected at most {most}")
             cloud = cloud_of(message)
-        upward = path_up(edges, _name(message.header.frame_id), world_frame)
-        return cloud, transform_up(edges, upward, _seconds(message.header.stamp))
+        return cloud, transform_up(edges, upward(message), _seconds(message.header.stamp))
+
+    def upward(message: Any) -> list[str]:
+        own = _name(message.header.frame_id)
+        if own == sensor:
+            return above
+        if own not in edges or own == above[-1]:
+            raise ValueError(
+                f"{path}, {clouds[0].topic}: cloud in frame {own!r}, which has no transform up to "
+                f"the frame of the map, {above[-1]!r}"
+            )
+        return _unique_path_up(edges, own, above[-1])
 
     stream = FrameStream(path, len(times), frame)
     weakref.finalize(stream, kept_open.close)
@@ -252,6 +240,80 @@ def _timed(rows: list[_Row], source: str) -> TimedPoses:
         quaternions=np.array([(q.x, q.y, q.z, q.w) for _, _, q in rows]),
         source=source,
     )
+
+
+def _tree(
+    path: Path,
+    transforms: list[_Transform],
+    odometry: dict[str, list[_Transform]],
+    sensor: str,
+    odometry_topic: str | None,
+    world_frame: str | None,
+) -> tuple[dict[str, Edge], list[str]]:
+    """Returns the tree of frames, and the path in it from the sensor up to the map."""
+    if world_frame is not None and not isinstance(world_frame, str):
+        raise ValueError(f"{path}: world_frame is {world_frame!r}, expected a frame's name")
+    world_frame = None if world_frame is None else _name(world_frame)
+    edges = _edges(path, transforms)
+    if odometry_topic is None:
+        odometry_topic = _default_odometry(path, edges, odometry, sensor, world_frame)
+    if odometry_topic is not None:
+        edges |= _odometry_edges(path, edges, odometry, sensor, odometry_topic)
+    to_root = path_up(edges, sensor)
+    if world_frame is not None:
+        _check_world_frame(path, edges, to_root, world_frame)
+    elif odometry_topic is None and not moving(edges, to_root):  # odometry may well stand still
+        raise ValueError(
+            f"{path}: nothing moves above the cloud's frame, {' in '.join(to_root)}; expected tf, "
+            f"or one of the odometry topics {sorted(odometry)} whose child is one of these frames, "
+            "or a world_frame if the sensor stands still"
+        )
+    return edges, _unique_path_up(edges, sensor, world_frame)
+
+
+def _odometry_edges(
+    path: Path,
+    edges: dict[str, Edge],
+    odometry: dict[str, list[_Transform]],
+    sensor: str,
+    topic: str,
+) -> dict[str, Edge]:
+    """Returns the edges of an odometry topic, one of them above the sensor."""
+    if topic not in odometry:
+        raise ValueError(f"{path}: odometry_topic = {topic!r}, expected one of {sorted(odometry)}")
+    moved = _edges(path, odometry[topic])
+    above = path_up(edges | moved, sensor)
+    if moved.keys().isdisjoint(above):
+        raise ValueError(
+            f"{path}: odometry topic {topic} moves {list(moved)}, expected one of {above}, the "
+            "frames from the cloud's frame upward"
+        )
+    return moved
+
+
+def _check_world_frame(
+    path: Path, edges: dict[str, Edge], to_root: list[str], world_frame: str
+) -> None:
+    """Raises unless a frame can be that of the map, for a sensor with this path to the root."""
+    if world_frame not in to_root:
+        raise ValueError(
+            f"{path}: frame {world_frame!r} is not above {to_root[0]!r}, expected one of "
+            f"{to_root[1:]}"
+        )
+    if world_frame == to_root[0] and moving(edges, to_root):
+        raise ValueError(
+            f"{path}: world_frame = {world_frame!r}, which is the clouds' own and moves; expected "
+            f"one of {to_root[1:]}"
+        )
+
+
+def _unique_path_up(edges: dict[str, Edge], frame: str, top: str | None) -> list[str]:
+    """Calls `path_up`, and checks that no edge on the path has two poses at one time."""
+    path = path_up(edges, frame, top)
+    for child in path[:-1]:
+        if not edges[child].fixed:
+            check_unique(edges[child].motion)
+    return path
 
 
 def _default_odometry(

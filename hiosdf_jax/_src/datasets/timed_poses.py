@@ -63,15 +63,31 @@ def read_timed_poses(path: str | os.PathLike[str]) -> TimedPoses:
             f"{path}, line {lines[i]}: time {rows[i, 0]:.6f} s after {rows[i - 1, 0]:.6f} s, "
             "expected times that never decrease"
         )
-    same = np.diff(rows[:, 0]) == 0
-    twice = np.flatnonzero(same & (np.diff(rows[:, 1:], axis=0) != 0).any(axis=1))
+    poses = TimedPoses(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
+    check_unique(poses)
+    return poses
+
+
+def check_unique(poses: TimedPoses) -> None:
+    """Checks that there is one pose at a time; it may be repeated.
+
+    Args:
+        poses: The poses.
+
+    Raises:
+        ValueError: Two poses at one time differ. The message names the source, and the lines if
+            it is a file.
+    """
+    values = np.hstack([poses.positions, poses.quaternions])
+    same = np.diff(poses.stamps) == 0
+    twice = np.flatnonzero(same & (np.diff(values, axis=0) != 0).any(axis=1))
     if len(twice):
         i = twice[0] + 1
+        than = "" if poses.lines is None else f" than in line {poses.lines[i - 1]}"
         raise ValueError(
-            f"{path}, line {lines[i]}: another pose at {rows[i, 0]:.6f} s than in line "
-            f"{lines[i - 1]}, expected one pose at a time"
+            f"{poses.place(i)}: another pose at {poses.stamps[i]:.6f} s{than}, expected one pose "
+            "at a time"
         )
-    return TimedPoses(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
 
 
 def pose_at(poses: TimedPoses, stamp: float, max_gap: float) -> np.ndarray:

@@ -44,10 +44,14 @@ def path_up(edges: dict[str, Edge], frame: str, top: str | None = None) -> list[
     while path[-1] != top and path[-1] in edges:
         parent = edges[path[-1]].parent
         if parent in path:
-            raise ValueError(f"frames form a cycle: {[*path, parent]}, expected a tree")
+            source = edges[path[-1]].motion.source
+            raise ValueError(f"{source}: frames form a cycle: {[*path, parent]}, expected a tree")
         path.append(parent)
     if top is not None and path[-1] != top:
-        raise ValueError(f"frame {top!r} is not above {frame!r}, expected one of {path[1:]}")
+        source = f"{edges[frame].motion.source}: " if frame in edges else ""
+        raise ValueError(
+            f"{source}frame {top!r} is not above {frame!r}, expected one of {path[1:]}"
+        )
     return path
 
 
