@@ -18,6 +18,20 @@ def test_exported_frames(tmp_path):
     check_stream(stream, [backproject(raw, 1000) for raw in RAW], POSES)
 
 
+def test_a_skewed_camera(tmp_path):
+    folder = write_scannet(tmp_path)
+    path = folder / "intrinsic" / "intrinsic_depth.txt"
+    matrix = np.loadtxt(path)
+    matrix[0, 1] = 0.5
+    write_text(path, *matrix)
+    cloud, _ = scannet_stream(folder)[0]
+    pixels = cloud @ matrix[:3, :3].T
+    v, u = np.divmod(np.arange(len(cloud)), RAW.shape[2])
+    seen = RAW[0].ravel() > 0
+    expected = np.stack([u, v], axis=-1)[seen]
+    np.testing.assert_allclose((pixels[:, :2] / pixels[:, 2:])[seen], expected, atol=1e-4)
+
+
 def test_bad_frames(tmp_path):
     folder = write_scannet(tmp_path)
     path = folder / "pose" / "9.txt"
@@ -35,9 +49,12 @@ def test_bad_frames(tmp_path):
 def test_bad_files(tmp_path):
     folder = write_scannet(tmp_path)
     path = folder / "intrinsic" / "intrinsic_depth.txt"
-    write_text(path, *np.zeros((4, 4)))
-    with pytest.raises(ValueError, match=re.escape(f"{path}: intrinsics are [0.0, ")):
-        scannet_stream(folder)
+    matrix = np.loadtxt(path)
+    for wrong, reason in ((0 * matrix, "focal lengths > 0"), (matrix.T, "is it transposed?")):
+        write_text(path, *wrong)
+        message = f"{re.escape(f'{path}: camera matrix is [[')}.*{re.escape(reason)}"
+        with pytest.raises(ValueError, match=message):
+            scannet_stream(folder)
     path.unlink()
     with pytest.raises(FileNotFoundError):
         scannet_stream(folder)

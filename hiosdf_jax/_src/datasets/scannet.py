@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.depth import pinhole, read_depth
+from hiosdf_jax._src.datasets.depth import read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
+from hiosdf_jax._src.datasets.sensors import check_camera
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.numerics.intake import check_pose
 
@@ -41,8 +42,8 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")
     path = folder / "intrinsic" / "intrinsic_depth.txt"
-    values = _matrix(path)
-    matrix = pinhole([values[0, 0], values[1, 1], values[0, 2], values[1, 2]], path)
+    matrix = _matrix(path)[:3, :3]
+    check_camera(f"{path}: camera matrix", matrix)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         number, image = images[index]
