@@ -8,7 +8,16 @@ import zlib
 
 import numpy as np
 import pytest
-from recordings import POSES, RAW, backproject, check_bad, check_stream, write_scannet, write_text
+from recordings import (
+    POSES,
+    RAW,
+    backproject,
+    check_bad,
+    check_stream,
+    write_png,
+    write_scannet,
+    write_text,
+)
 
 from hiosdf_jax.datasets import open_stream, scannet_stream
 
@@ -16,6 +25,19 @@ from hiosdf_jax.datasets import open_stream, scannet_stream
 def test_exported_frames(tmp_path):
     stream = open_stream(write_scannet(tmp_path))
     check_stream(stream, [backproject(raw, 1000) for raw in RAW], POSES)
+
+
+@pytest.mark.parametrize("folders", [["depth", "pose"], ["depth"]])
+def test_names_with_leading_zeros(tmp_path, folders):
+    folder = write_scannet(tmp_path)
+    for path in [path for name in folders for path in (folder / name).iterdir()]:
+        path.rename(path.with_stem(path.stem.zfill(6)))
+    check_stream(open_stream(folder), [backproject(raw, 1000) for raw in RAW], POSES)
+    (folder / "pose" / ("000009.txt" if "pose" in folders else "9.txt")).unlink()
+    check_bad(scannet_stream(folder), 2, "000009.txt: No such file or directory")
+    write_png(folder / "depth" / "9.png", RAW[0])
+    with pytest.raises(ValueError, match=r"000009\.png: is frame 9, as is 9\.png, expected one"):
+        scannet_stream(folder)
 
 
 def test_a_skewed_camera(tmp_path):
