@@ -64,6 +64,18 @@ def test_folders_of_clouds(tmp_path, names, stamps, suffix):
     check_stream(open_stream(folder), CLOUDS, POSES, atol=1e-4)
 
 
+def test_the_trajectory_of_a_run_numbers_the_clouds(tmp_path):
+    folder = write_clouds(tmp_path, range(1, FRAMES + 1))
+    path = folder / "trajectory.txt"
+    write_poses(path, range(FRAMES))
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text("# frame tx ty tz qx qy qz qw\n" + "".join(rows[:1] + rows[2:]))
+    stream = open_stream(folder)
+    for i in (0, 2, 3):
+        np.testing.assert_allclose(stream[i][1], POSES[i], atol=1e-6)
+    check_bad(stream, 1, path, "no pose for 1.000000 s")
+
+
 @pytest.mark.parametrize("suffix", [".PLY", ".PCD"])
 def test_endings_of_any_case(tmp_path, suffix):
     folder = write_clouds(tmp_path, range(FRAMES), suffix.lower())

@@ -6,7 +6,8 @@
 If the file names are times within the trajectory (seconds, or nanoseconds as whole numbers), each
 cloud gets the pose interpolated at its time. Otherwise there must be as many poses as clouds, and
 the poses belong to the clouds in the order of their names. So they do where the trajectory only
-numbers as many poses as there are clouds: 0, 1, 2, ...
+numbers as many poses as there are clouds: 0, 1, 2, ... A file that begins with `# frame`, as a run
+writes it, has numbers of clouds in this order, from 0, and may lack some.
 
 With as many poses as clouds, both readings may give poses, but not the same ones. If the times then
 leave a cloud without a pose, the folder is refused.
@@ -24,7 +25,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
+from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing, read_lines
 from hiosdf_jax._src.datasets.inflating import most_inflated
 from hiosdf_jax._src.datasets.stream import FrameStream
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses, rows_at
@@ -65,8 +66,9 @@ def cloud_stream(
         raise ValueError(f"{folder}: has no .ply or .pcd file, expected at least one")
     if any(path.suffix.lower() == ".pcd" for path in clouds):
         _require_pypcd4()
-    poses = read_timed_poses(_only_trajectory(folder) if trajectory is None else trajectory)
-    stamps = _stamps(clouds, poses)
+    trajectory = _only_trajectory(folder) if trajectory is None else trajectory
+    poses = read_timed_poses(trajectory)
+    stamps = np.arange(len(clouds)) if _numbers_frames(trajectory) else _stamps(clouds, poses)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         path = clouds[index]
@@ -100,6 +102,12 @@ def _only_trajectory(folder: Path) -> Path:
         names = [path.name for path in found]
         raise ValueError(f"{folder}: trajectory is one of {names}, expected one .txt or .tum file")
     return found[0]
+
+
+def _numbers_frames(trajectory: str | os.PathLike[str]) -> bool:
+    """Whether a run wrote the file, which has numbers of frames instead of times."""
+    _, first = next(read_lines(trajectory))
+    return first.split()[:2] == ["#", "frame"]
 
 
 def _stamps(clouds: list[Path], poses: TimedPoses) -> np.ndarray:
