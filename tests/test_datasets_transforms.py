@@ -55,9 +55,10 @@ def test_a_pose_that_is_repeated_does_not_move():
         moved = timed(poses, range(5))
         getattr(moved, name)[3, 1] += 1e-3
         assert moves(moved)
-    lost = timed(poses, range(5))
-    lost.positions[2] = np.nan
-    assert moves(lost)
+    for lost in (np.nan, np.inf):
+        moved = timed(poses, range(5))
+        moved.positions[:] = lost
+        assert moves(moved)
     edges = {
         "lidar": Edge("pan", still, fixed=False),
         "pan": Edge("base", moved, fixed=False),

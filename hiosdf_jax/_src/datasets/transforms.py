@@ -73,9 +73,10 @@ def moving(edges: dict[str, Edge], path: list[str]) -> list[str]:
 def moves(motion: TimedPoses) -> bool:
     """Returns whether poses differ; those that are not finite do."""
     # A quaternion and its negative are one rotation.
-    signs = np.where(motion.quaternions @ motion.quaternions[0] < 0, -1, 1)
-    poses = np.hstack([motion.positions, signs[:, None] * motion.quaternions])
-    return not (np.abs(poses - poses[0]) <= _STILL).all()
+    with np.errstate(invalid="ignore"):
+        signs = np.where(motion.quaternions @ motion.quaternions[0] < 0, -1, 1)
+        poses = np.hstack([motion.positions, signs[:, None] * motion.quaternions])
+        return not (np.abs(poses - poses[0]) <= _STILL).all()
 
 
 def transform_up(edges: dict[str, Edge], path: list[str], stamp: float) -> np.ndarray:
