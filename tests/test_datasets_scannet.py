@@ -2,20 +2,39 @@
 
 import os
 import re
+import shutil
 import struct
 import tracemalloc
 import zlib
 
 import numpy as np
 import pytest
-from recordings import POSES, RAW, backproject, check_bad, check_stream, write_scannet, write_text
+from recordings import (
+    IDENTITIES,
+    POSES,
+    RAW,
+    backproject,
+    check_bad,
+    check_stream,
+    write_scannet,
+    write_text,
+)
 
-from hiosdf_jax.datasets import open_stream, scannet_stream
+from hiosdf_jax.datasets import NoPosesError, open_stream, scannet_stream
 
 
 def test_exported_frames(tmp_path):
     stream = open_stream(write_scannet(tmp_path))
     check_stream(stream, [backproject(raw, 1000) for raw in RAW], POSES)
+
+
+def test_frames_without_poses(tmp_path):
+    folder = write_scannet(tmp_path)
+    shutil.rmtree(folder / "pose")
+    with pytest.raises(NoPosesError, match="has no poses, expected them in the folder pose"):
+        open_stream(folder)
+    clouds = [backproject(raw, 1000) for raw in RAW]
+    check_stream(open_stream(folder, poses=False), clouds, IDENTITIES)
 
 
 def test_bad_frames(tmp_path):

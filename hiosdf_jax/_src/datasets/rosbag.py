@@ -11,7 +11,9 @@ The `rosbags` package reads both kinds of bag without ROS.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import struct
 import weakref
 from collections import defaultdict
 from collections.abc import Iterable
@@ -22,7 +24,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 from hiosdf_jax._src.datasets.inflating import limit_rosbags
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses
 from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
 
@@ -43,6 +45,8 @@ def rosbag_stream(
     cloud_topic: str | None = None,
     odometry_topic: str | None = None,
     world_frame: str | None = None,
+    *,
+    poses: bool = True,
 ) -> FrameStream:
     """Opens a ROS 1 or ROS 2 bag.
 
@@ -52,6 +56,7 @@ def rosbag_stream(
         odometry_topic: Topic of Odometry messages, which replace tf for their child frame. By
             default odometry is used if there is one topic and tf contains no motion.
         world_frame: Frame of the map; by default the root of the tf tree.
+        poses: Whether to read tf and odometry. If not, each pose is the identity.
 
     Returns:
         The clouds as a stream. A cloud without transforms at its time is a bad frame. The bag
@@ -59,8 +64,8 @@ def rosbag_stream(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The bag cannot be read, a topic is missing or ambiguous, or the bag does not
-            contain the motion of the sensor.
+        NoPosesError: The bag does not contain the motion of the sensor.
+        ValueError: The bag cannot be read, or a topic is missing or ambiguous.
         ModuleNotFoundError: rosbags is not installed.
 
     Example:
@@ -93,6 +98,8 @@ def rosbag_stream(
             times, transforms, odometry, first = _scan(reader, clouds)
         if first is None:
             raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message, expected clouds")
+        if not poses:  # nothing is above the sensor then, and its pose is the identity
+            transforms, odometry, odometry_topic, world_frame = [], {}, None, None
         edges = _edges(path, transforms)
         sensor = _name(first.header.frame_id)
         if odometry_topic is None and not _moves(edges, sensor) and len(odometry) == 1:
@@ -106,13 +113,13 @@ def rosbag_stream(
             moved = _edges(path, odometry[odometry_topic])
             edges |= moved
             if moved.keys().isdisjoint(path_up(edges, sensor)):
-                raise ValueError(
+                raise NoPosesError(
                     f"{path}: odometry topic {odometry_topic} moves {list(moved)}, expected one of "
                     f"{path_up(edges, sensor)}, the frames from the cloud's frame upward"
                 )
         above = path_up(edges, sensor, world_frame)
-        if world_frame is None and not _moves(edges, sensor):
-            raise ValueError(
+        if poses and world_frame is None and not _moves(edges, sensor):
+            raise NoPosesError(
                 f"{path}: nothing moves above the cloud's frame, {' in '.join(above)}; expected "
                 f"tf, or one of the odometry topics {sorted(odometry)} whose child is one of these "
                 "frames, or a world_frame if the sensor stands still"
@@ -120,7 +127,7 @@ def rosbag_stream(
         kept_open = closing.pop_all()
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
-        start, among = times[index]
+        start, among, _ = times[index]
         with parsing(f"{path}, {clouds[0].topic} at {start} ns", "PointCloud2"):
             with contextlib.closing(reader.messages(clouds, start=start, stop=start + 1)) as found:
                 connection, _, raw = next(m for i, m in enumerate(found) if i == among)
@@ -132,7 +139,7 @@ def rosbag_stream(
         upward = path_up(edges, _name(message.header.frame_id), world_frame)
         return cloud, transform_up(edges, upward, _seconds(message.header.stamp))
 
-    stream = FrameStream(path, len(times), frame)
+    stream = FrameStream(path, len(times), frame, [stamp for _, _, stamp in times])
     weakref.finalize(stream, kept_open.close)
     return stream
 
@@ -188,22 +195,23 @@ def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection
 
 def _scan(
     reader: AnyReader, clouds: list[Connection]
-) -> tuple[list[tuple[int, int]], list[tuple[str, str, bool, _Row]], dict[str, list], Any]:
+) -> tuple[list[tuple[int, int, float]], list[tuple[str, str, bool, _Row]], dict[str, list], Any]:
     """Reads a bag once, one message at a time.
 
     Returns:
-        For each cloud the time of recording, ns, and its rank among the clouds of that time; the
-        transforms of tf; the transforms of each odometry topic; the first cloud's message.
+        For each cloud the time of recording, ns, its rank among the clouds of that time, and its
+        stamp, s; the transforms of tf; the transforms of each odometry topic; the first cloud's
+        message.
     """
     wanted = [c for c in reader.connections if c.msgtype in (*_TRANSFORMS, _ODOMETRY)]
-    times: list[tuple[int, int]] = []
+    times: list[tuple[int, int, float]] = []
     transforms: list[tuple[str, str, bool, _Row]] = []
     odometry: dict[str, list] = defaultdict(list)
     first = None
     for connection, time, raw in reader.messages([*clouds, *wanted]):
         if connection.msgtype == _CLOUD:
             again = bool(times) and times[-1][0] == time
-            times.append((time, times[-1][1] + 1 if again else 0))
+            times.append((time, times[-1][1] + 1 if again else 0, _stamp_of(raw, reader.is2)))
             if first is None:
                 first = reader.deserialize(raw, connection.msgtype)
             continue
@@ -251,6 +259,19 @@ def _moves(edges: dict[str, Edge], frame: str) -> bool:
 
 def _name(frame: str) -> str:
     return frame.lstrip("/")  # old tf wrote names with a leading slash
+
+
+def _stamp_of(raw: bytes, is_ros2: bool) -> float:
+    """Time of a message that begins with a header, s, without the cost of reading the rest of it.
+
+    Four bytes are before the stamp: a count in ROS 1, and in ROS 2 the encoding, whose second byte
+    is the order of the bytes.
+    """
+    if len(raw) < 12:
+        return math.nan
+    order = ">" if is_ros2 and raw[1] == 0 else "<"
+    seconds, nanoseconds = struct.unpack_from(f"{order}II", raw, 4)
+    return seconds + 1e-9 * nanoseconds
 
 
 def _seconds(stamp: Any) -> float:

@@ -14,17 +14,18 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.numerics.intake import check_pose
 
 _SCALE = 1000.0  # depth is in mm
 
 
-def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
+def scannet_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> FrameStream:
     """Opens the exported frames of a ScanNet scene.
 
     Args:
         folder: The folder with `depth`, `pose` and `intrinsic`.
+        poses: Whether to read `pose`. If not, each pose is the identity.
 
     Returns:
         The depth images as a stream. An image without a pose, or with ScanNet's -inf, is a bad
@@ -32,6 +33,7 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
 
     Raises:
         FileNotFoundError: A file or folder is missing.
+        NoPosesError: There is no folder `pose`.
         ValueError: A file is malformed; the message names it and the line.
 
     Example:
@@ -40,6 +42,8 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
     """
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")
+    if poses and not (folder / "pose").exists():
+        raise NoPosesError(f"{folder}: has no poses, expected them in the folder pose")
     path = folder / "intrinsic" / "intrinsic_depth.txt"
     values = _matrix(path)
     matrix = pinhole([values[0, 0], values[1, 1], values[0, 2], values[1, 2]], path)
@@ -47,7 +51,7 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         number, image = images[index]
         source = folder / "pose" / f"{number}.txt"
-        pose = check_pose(_matrix(source), str(source))
+        pose = check_pose(_matrix(source), str(source)) if poses else np.eye(4)
         return read_depth(image, _SCALE, matrix), pose
 
     return FrameStream(folder, len(images), frame)
