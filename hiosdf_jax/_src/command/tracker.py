@@ -170,9 +170,10 @@ class Tracker:
         quaternions = without_flips(Rotation.from_matrix(poses[:, :3, :3]).as_quat())
         time = self._times(*frame)
         rows = np.column_stack([time, poses[:, :3, 3], quaternions])
-        digits = ["%d" if np.array_equal(time, frame) else "%.9f"] + 7 * ["%.9g"]
+        # Readers of this file tell numbers of frames from times by the first word.
+        name, digits = ("frame", "%d") if np.array_equal(time, frame) else ("time", "%.9f")
         with replacing(folder / TRAJECTORY[0]) as file:
-            np.savetxt(file, rows, digits, header="time tx ty tz qx qy qz qw")
+            np.savetxt(file, rows, [digits] + 7 * ["%.9g"], header=f"{name} tx ty tz qx qy qz qw")
         with replacing(folder / TRAJECTORY[1]) as file:
             np.savez(
                 file,
