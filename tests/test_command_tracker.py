@@ -109,6 +109,7 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     assert way_cm(given, exact).max() > 6.9
     assert way_cm(poses, exact).max() < 3
     assert covariance.shape == (FRAMES, 6, 6)
+    assert (output / "trajectory.txt").read_text().startswith("# frame ")  # the reader looks for it
     text = read_timed_poses(output / "trajectory.txt")
     for i in range(FRAMES):
         np.testing.assert_allclose(pose_at(text, i, 0.1), poses[i], atol=1e-5)

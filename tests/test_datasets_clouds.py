@@ -50,6 +50,11 @@ def write_poses(path, stamps):
         (["100.5", "100.6", "100.7", "100.8"], [100.5, 100.6, 100.7, 100.8]),
         ([1403636579763555584 + 10**8 * i for i in range(4)], None),
         (["9", "10", "11", "100"], [0.1, 0.2, 0.3, 0.4]),
+        (["9.9", "10.0", "10.05", "10.1"], [9.9, 10.0, 10.05, 10.1]),  # 5 hundredths come before 1
+        (["-1", "0", "1", "2"], [-1, 0, 1, 2]),
+        (["1.1", "1.2", "1.9", "1.10"], [7, 8, 9, 10]),  # versions, of which two are one number
+        (["1_9", "1_10", "2_1", "2_2"], [7, 8, 9, 10]),
+        (["1", "2", "3", "4"], [0, 1, 2, 3]),  # times that only number the poses
         (["scan_2", "scan_10", "scan_11", "scan_200"], [0.1, 0.2, 0.3, 0.4]),
         (["2", "10", "11\u00b2", "200"], [0.1, 0.2, 0.3, 0.4]),  # a digit that is no number
     ],
@@ -58,6 +63,30 @@ def test_folders_of_clouds(tmp_path, names, stamps, suffix):
     folder = write_clouds(tmp_path, names, suffix)
     write_poses(tmp_path / "poses.txt", stamps or [f"{name * 1e-9:.7f}" for name in names])
     check_stream(open_stream(folder), CLOUDS, POSES, atol=1e-4)
+
+
+def test_the_trajectory_of_a_run_numbers_the_clouds(tmp_path):
+    folder = write_clouds(tmp_path, range(1, FRAMES + 1))
+    path = folder / "trajectory.txt"
+    write_poses(path, range(FRAMES))
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text("# frame tx ty tz qx qy qz qw\n" + "".join(rows[:1] + rows[2:]))
+    stream = open_stream(folder)
+    for i in (0, 2, 3):
+        np.testing.assert_allclose(stream[i][1], POSES[i], atol=1e-6)
+    check_bad(stream, 1, path, "no pose for 1.000000 s")
+
+
+@pytest.mark.parametrize("suffix", [".PLY", ".PCD"])
+def test_endings_of_any_case(tmp_path, suffix):
+    folder = write_clouds(tmp_path, range(FRAMES), suffix.lower())
+    for i in (0, 2):
+        (folder / f"{i}{suffix.lower()}").rename(folder / f"{i}{suffix}")
+    write_poses(tmp_path / "poses.txt", range(FRAMES))
+    check_stream(open_stream(folder), CLOUDS, POSES)
+    for each in (1, 3):
+        (folder / f"{each}{suffix.lower()}").unlink()
+    assert len(open_stream(folder)) == 2
 
 
 def test_cloud_poses_are_interpolated(tmp_path):
@@ -118,13 +147,25 @@ def test_clouds_without_poses(tmp_path):
     with pytest.raises(NoPosesError, match=r"has no poses, expected a trajectory in a \.txt or"):
         open_stream(folder)
     write_poses(folder / "poses.txt", [2, 2.9, 3.05, 5])
-    # Names within the trajectory are times, even with as many poses: 1 and 4 have no pose near.
+    # By time, 2 has the first pose; by order, the second.
+    message = (
+        r"poses\.txt: 4 poses for as many clouds, but none at the time of 1\.ply; expected one"
+    )
+    with pytest.raises(ValueError, match=message):
+        open_stream(folder)
+    # Names within the trajectory are times. Now 1 and 4 have no pose near.
+    with open(folder / "poses.txt", "a") as file:
+        file.write("6 0 0 0 0 0 0 1")
     stream = open_stream(folder)
     np.testing.assert_allclose(stream[1][1], POSES[0], atol=1e-6)
     assert np.isfinite(stream[2][1]).all()
     for i in (0, 3):
         with pytest.raises(BadFrameError, match=f"frame {i}: .*no pose for {i + 1}.000000 s"):
             read_frame(stream, i)
+    # As many poses that agree with the order, but for the one that is missing.
+    write_poses(folder / "poses.txt", [1.5, 2, 3, 4])
+    check_bad(open_stream(folder), 0, "no pose for 1.000000 s")
+    np.testing.assert_allclose(open_stream(folder)[3][1], POSES[3], atol=1e-6)
     write_poses(folder / "poses.txt", [7, 8, 9, 10])
     np.testing.assert_allclose(open_stream(folder)[0][1], POSES[0], atol=1e-6)
     edit_line(folder / "poses.txt", 4, "")

@@ -155,6 +155,7 @@ def test_a_bad_pose_is_a_bad_frame(tmp_path):
         (DEPTH, {"depth_scale": np.ones(3)}, r"depth_scale has shape \(3,\), expected \(\)"),
         (DEPTH, {"K": np.eye(4)}, r"K has shape \(4, 4\), expected \(3, 3\)"),
         (DEPTH, {"K": np.zeros((3, 3))}, "expected focal lengths > 0"),
+        (DEPTH, {"K": DEPTH["K"].T}, r"K is \[\[4.*, expected 0, 0, 1 in .*; is it transposed\?"),
         (DEPTH, {"depth": np.ones((3, 4))}, r"depth has shape \(3, 4\), expected \(F, H, W\)"),
         (DEPTH, {"poses": POSES[:2]}, r"poses has shape \(2, 4, 4\), expected \(3, 4, 4\)"),
         (DEPTH, {"poses": POSES[:, :3]}, r"poses has shape \(3, 3, 4\), expected \(3, 4, 4\)"),

@@ -187,9 +187,15 @@ def test_map_corrections_above_the_odometry(tmp_path):
         open_stream(bag.path)[2][1], correction @ motion(STAMPS[2]) @ MOUNT, atol=1e-5
     )
     check_stream(open_stream(bag.path, world_frame="odom"))
-    check_stream(open_stream(path, world_frame="odom"))
-    with pytest.raises(ValueError, match="frame 'earth' is not above 'lidar'"):
-        open_stream(path, world_frame="earth")
+    for name in ("odom", "/odom"):
+        check_stream(open_stream(path, world_frame=name))
+    for name, message in (
+        ("earth", "frame 'earth' is not above 'lidar', expected one of"),
+        ("lidar", "world_frame = 'lidar', which is the clouds' own and moves; expected one of"),
+        (5, "world_frame is 5, expected a frame's name"),
+    ):
+        with pytest.raises(ValueError, match=f"{re.escape(str(path))}: {message}"):
+            open_stream(path, world_frame=name)
     _, pose = open_stream(path, world_frame="base")[0]
     np.testing.assert_allclose(pose, MOUNT, atol=1e-6)
 
@@ -208,12 +214,75 @@ def test_topics_are_chosen_by_name(tmp_path):
         ValueError, match=r"cloud_topic = None, expected one of \['/points', '/raw'\]"
     ):
         open_stream(bag.path)
-    np.testing.assert_allclose(open_stream(bag.path, cloud_topic="/points")[0][1], MOUNT, atol=1e-6)
+    with pytest.raises(ValueError, match=r"nothing moves .* topics \['/good', '/other'\] whose"):
+        open_stream(bag.path, cloud_topic="/points")
+    still = open_stream(bag.path, cloud_topic="/points", world_frame="odom")
+    np.testing.assert_allclose(still[0][1], MOUNT, atol=1e-6)
     check_stream(open_stream(bag.path, cloud_topic="/points", odometry_topic="/good"))
     with pytest.raises(ValueError, match=r"odometry_topic = '/bad', expected one of \['/good'"):
         open_stream(bag.path, cloud_topic="/points", odometry_topic="/bad")
     with pytest.raises(ValueError, match=r"/other moves \['body'\], expected one of \['lidar'"):
         open_stream(bag.path, cloud_topic="/points", odometry_topic="/other")
+
+
+TURNED = np.eye(4)
+TURNED[:3, :3] = Rotation.from_rotvec([0, 0, 2.0]).as_matrix()
+
+
+def write_joint(path, joint, *topics, above=None):
+    """A lidar on a joint that is at the pose `joint(time)`, and odometry of (topic, child)."""
+    with Bag(path, "mcap") as bag:
+        for time in np.arange(START, START + 1, 0.07):
+            bag.write_transform(time, "base", "lidar", joint(time))
+            if above is not None:
+                bag.write_transform(time, "odom", "base", above(time))
+            for topic, child in topics:
+                bag.write_odometry(time, "odom", child, motion(time), topic)
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud)
+    return bag.path
+
+
+def still(_):
+    return MOUNT
+
+
+def pan(time):
+    return MOUNT if time < START + 0.4 else TURNED
+
+
+@pytest.mark.parametrize("above", [None, still])
+def test_transforms_that_do_not_move_the_robot_leave_that_to_odometry(tmp_path, above):
+    """As of ROS 1's static_transform_publisher, and of a joint under the lidar."""
+    wheels = ("/wheels", "base")
+    check_stream(open_stream(write_joint(tmp_path / "still", still, wheels, above=above)))
+    path = write_joint(tmp_path / "pan", pan, wheels, above=above)
+    for i, mount in ((0, MOUNT), (4, TURNED)):
+        np.testing.assert_allclose(open_stream(path)[i][1], motion(STAMPS[i]) @ mount, atol=2e-6)
+    path = write_joint(tmp_path / "alone", still, above=above)
+    with pytest.raises(ValueError, match="nothing moves above the cloud's frame, lidar in base"):
+        open_stream(path)
+
+
+def test_tf_with_the_motion_of_the_robot_takes_precedence(tmp_path):
+    def halved(time):
+        return motion(START + (time - START) / 2)
+
+    expected = halved(STAMPS[2]) @ MOUNT
+    for i, children in enumerate((["base"], ["gps"], ["base", "gps"])):  # gps is in odom, too
+        topics = [(f"/{child}", child) for child in children]
+        path = write_joint(tmp_path / str(i), still, *topics, above=halved)
+        np.testing.assert_allclose(open_stream(path)[2][1], expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("topics", [[("/vio", "eye")], [("/vio", "base"), ("/wheels", "base")]])
+def test_motion_in_tf_or_odometry_is_for_the_caller_to_choose(tmp_path, topics):
+    path = write_joint(tmp_path / "drive", pan, *topics)
+    with pytest.raises(
+        ValueError, match=r"tf moves \['lidar'\], and .*'/vio'.* odometry_topic= or"
+    ):
+        open_stream(path)
+    np.testing.assert_allclose(open_stream(path, world_frame="base")[4][1], TURNED, atol=1e-6)
 
 
 def test_bags_without_motion_or_clouds(tmp_path):
@@ -255,6 +324,52 @@ def test_clouds_recorded_at_the_same_time(tmp_path):
     for i in range(5):
         np.testing.assert_array_equal(stream[i][0], CLOUDS[i])
         np.testing.assert_allclose(stream[i][1], motion(STAMPS[i]), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ("lidar2", "in frame 'lidar2', which has no transform up to the frame of the map, 'odom'"),
+        ("odom", "in frame 'odom', which has no transform up to"),
+        ("mirror", r"mirror in mast: frame 'odom' is not above 'mirror', expected one of \['mast'"),
+        ("rear", None),
+    ],
+)
+def test_later_clouds_in_other_frames(tmp_path, frame, message):
+    with Bag(tmp_path / "drive", "mcap") as bag:
+        bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        bag.write_transform(START, "base", "rear", TURNED, "/tf_static")
+        bag.write_transform(START, "mast", "mirror", MOUNT, "/tf_static")
+        for time in np.arange(START, START + 1, 0.07):
+            bag.write_transform(time, "odom", "base", motion(time))
+        bag.write_cloud(STAMPS[0], CLOUDS[0])
+        bag.write_cloud(STAMPS[1], CLOUDS[1], frame)
+    stream = open_stream(bag.path)
+    np.testing.assert_allclose(stream[0][1], motion(STAMPS[0]) @ MOUNT, atol=2e-6)
+    if message is None:
+        np.testing.assert_allclose(stream[1][1], motion(STAMPS[1]) @ TURNED, atol=2e-6)
+    else:
+        with pytest.raises(
+            BadFrameError, match=f"frame 1: {re.escape(str(bag.path))}, .*{message}"
+        ):
+            read_frame(stream, 1)
+
+
+def test_a_transform_has_one_pose_at_a_time(tmp_path):
+    with Bag(tmp_path / "drive", "mcap") as bag:
+        bag.write_transform(START, "base", "lidar", MOUNT, "/tf_static")
+        for time in np.repeat(np.arange(START, START + 1, 0.07), 2):
+            bag.write_transform(time, "odom", "base", motion(time))  # twice the same
+            bag.write_transform(START, "base", "wheel", motion(time))  # not on the way up
+        bag.write_transform(START, "map", "odom", np.eye(4))
+        bag.write_transform(START, "map", "odom", MOUNT)
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud)
+    with pytest.raises(
+        ValueError, match=r"drive, odom in map, at 1700000000\.0+ s: another pose at 1700000000\."
+    ):
+        open_stream(bag.path)
+    check_stream(open_stream(bag.path, world_frame="odom"))
 
 
 def test_frames_without_a_transform(tmp_path):

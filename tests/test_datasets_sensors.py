@@ -78,3 +78,32 @@ def test_messages_name_the_wrong_shape():
         depth_to_cloud(np.ones((2, 2)), np.ones(4))
     with pytest.raises(ValueError, match=r"directions has shape \(4, 3\), expected \(2, 2, 3\)"):
         ranges_to_cloud(np.ones((2, 2)), np.ones((4, 3)))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "reason"),
+    [
+        (K.T, r"0, 0, 1 in the last row; is it transposed\?"),
+        (K * 2, r"0, 0, 1 in the last row; is it scaled\?"),
+        (K * [[1, 1, 1], [1, 1, 1], [1, 1, 0]], r"0, 0, 1 in the last row; is it scaled\?"),
+        (K + 3 * np.eye(3, k=-1) * [[0], [1], [0]], "0 left of the second focal length"),
+        (K * [[-1], [1], [1]], "focal lengths > 0"),
+        (K * [[1], [1e-42], [1]], "focal lengths > 0"),  # not at the full precision of float32
+        (np.where(K == 3.5, np.inf, K), "finite numbers"),
+        (K * [[np.nan], [1], [1]], "finite numbers"),
+    ],
+)
+def test_matrices_that_are_no_pinhole(matrix, reason):
+    for intrinsics in (matrix, jnp.array(matrix.tolist())):
+        with pytest.raises(ValueError, match=rf"^intrinsics is \[\[.*\], expected {reason}$"):
+            depth_to_cloud(np.ones((2, 2)), intrinsics)
+
+
+def test_a_matrix_too_large_for_float32():
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        depth_to_cloud(np.ones((2, 2)), K * [[1e40], [1], [1]])
+
+
+def test_matrices_with_few_digits():
+    cloud = depth_to_cloud(np.ones((2, 2)), K + 1e-7)
+    np.testing.assert_allclose(cloud, depth_to_cloud(np.ones((2, 2)), K), atol=1e-6)

@@ -99,8 +99,12 @@ def test_bad_frames_are_skipped_or_raise():
     room.frames = room.frames[-4:]
     with pytest.raises(ValueError, match="none of the 4 frames"):
         find_bounds(room, skip_bad_frames=True)
-    with pytest.raises(ValueError, match="margin = -1"):
-        find_bounds(Room(), margin=-1)
+
+
+@pytest.mark.parametrize("margin", [-1, "a", None, np.nan, np.inf, [0.1, 0.2]])
+def test_a_margin_is_a_number(margin):
+    with pytest.raises(ValueError, match=r"^margin "):
+        find_bounds(Room(), margin=margin)
 
 
 def test_a_stray_pose_does_not_enlarge_the_bounds():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from poses import random_pose, timed
 
 from hiosdf_jax._src.datasets.timed_poses import pose_at
-from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
+from hiosdf_jax._src.datasets.transforms import Edge, moves, moving, path_up, transform_up
 
 SEEDS = st.integers(0, 2**31)
 
@@ -43,3 +43,25 @@ def test_frames_that_form_no_tree():
         path_up(edges, "a")
     with pytest.raises(ValueError, match="frame 'map' is not above 'c'"):
         path_up({"c": Edge("d", fixed, fixed=True)}, "c", "map")
+
+
+def test_a_pose_that_is_repeated_does_not_move():
+    rng = np.random.default_rng(0)
+    poses = [random_pose(rng)] * 5
+    still = timed(poses, range(5))
+    still.quaternions[::2] *= -1  # the same rotations
+    assert not moves(still)
+    for name in ("positions", "quaternions"):
+        moved = timed(poses, range(5))
+        getattr(moved, name)[3, 1] += 1e-3
+        assert moves(moved)
+    for lost in (np.nan, np.inf):
+        moved = timed(poses, range(5))
+        moved.positions[:] = lost
+        assert moves(moved)
+    edges = {
+        "lidar": Edge("pan", still, fixed=False),
+        "pan": Edge("base", moved, fixed=False),
+        "base": Edge("map", moved, fixed=True),
+    }
+    assert moving(edges, path_up(edges, "lidar")) == ["pan"]

@@ -5,8 +5,13 @@
 
 If the file names are times within the trajectory (seconds, or nanoseconds as whole numbers), each
 cloud gets the pose interpolated at its time. Otherwise there must be as many poses as clouds, and
-the poses belong to the clouds in the order of their names. Without poses the file names are the
-times, if they are numbers.
+the poses belong to the clouds in the order of their names. So they do where the trajectory only
+numbers as many poses as there are clouds: 0, 1, 2, ... A file that begins with `# frame`, as a run
+writes it, has numbers of clouds in this order, from 0, and may lack some.
+
+With as many poses as clouds, both readings may give poses, but not the same ones. If the times then
+leave a cloud without a pose, the folder is refused. Without poses the file names are the times, if
+they are numbers.
 """
 
 from __future__ import annotations
@@ -21,15 +26,16 @@ from typing import BinaryIO
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
+from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing, read_lines
 from hiosdf_jax._src.datasets.inflating import most_inflated
 from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
-from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses
+from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses, rows_at
 
 _MAX_GAP = 0.2  # s
 _PLY_HEADER_BYTES = 1 << 16
 _PCD_LINES = 10  # of a header
 _PCD_VALUES = 1000  # per point
+_TIME = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)", re.ASCII)
 _NANOSECONDS = 1e17  # times from here on are in nanoseconds
 
 
@@ -61,16 +67,17 @@ def cloud_stream(
         cloud, pose = stream[0]
     """
     folder = Path(folder)
-    clouds = sorted((p for p in folder.iterdir() if p.suffix in _READERS), key=_natural)
+    clouds = _sorted([path for path in folder.iterdir() if path.suffix.lower() in _READERS])
     if not clouds:
         raise ValueError(f"{folder}: has no .ply or .pcd file, expected at least one")
-    if any(path.suffix == ".pcd" for path in clouds):
+    if any(path.suffix.lower() == ".pcd" for path in clouds):
         _require_pypcd4()
     if not poses:
         stamps = [_stamp(path) for path in clouds]
         return FrameStream(folder, len(clouds), lambda i: (_read(clouds[i]), np.eye(4)), stamps)
-    timed = read_timed_poses(_only_trajectory(folder) if trajectory is None else trajectory)
-    stamps = _stamps(clouds, timed)
+    trajectory = _only_trajectory(folder) if trajectory is None else trajectory
+    timed = read_timed_poses(trajectory)
+    stamps = np.arange(len(clouds)) if _numbers_frames(trajectory) else _stamps(clouds, timed)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         return _read(clouds[index]), pose_at(timed, stamps[index], _MAX_GAP)
@@ -79,7 +86,17 @@ def cloud_stream(
 
 
 def _read(path: Path) -> np.ndarray:
-    return _READERS[path.suffix](path)
+    return _READERS[path.suffix.lower()](path)
+
+
+def _sorted(clouds: list[Path]) -> list[Path]:
+    """Sorts clouds by the times that are their names, or else by the numbers in their names."""
+    clouds = sorted(clouds, key=lambda path: (_natural(path), path.name))
+    stamps = np.array([_stamp(path) for path in clouds])
+    # Versions such as 1.1 and 1.10 are no times.
+    if np.isfinite(stamps).all() and len(np.unique(stamps)) == len(stamps):
+        return [clouds[i] for i in np.argsort(stamps)]
+    return clouds
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -92,7 +109,7 @@ def _parts(text: str) -> list[str]:
 
 
 def _only_trajectory(folder: Path) -> Path:
-    found = sorted(path for path in folder.iterdir() if path.suffix in (".txt", ".tum"))
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".txt", ".tum"))
     if not found:
         raise NoPosesError(f"{folder}: has no poses, expected a trajectory in a .txt or .tum file")
     if len(found) != 1:
@@ -101,14 +118,23 @@ def _only_trajectory(folder: Path) -> Path:
     return found[0]
 
 
+def _numbers_frames(trajectory: str | os.PathLike[str]) -> bool:
+    """Whether a run wrote the file, which has numbers of frames instead of times."""
+    _, first = next(read_lines(trajectory))
+    return first.split()[:2] == ["#", "frame"]
+
+
 def _stamps(clouds: list[Path], poses: TimedPoses) -> np.ndarray:
     """Time stamp of each cloud, (N,) s."""
     stamps = np.array([_stamp(path) for path in clouds])
     inside = (stamps >= poses.stamps[0]) & (stamps <= poses.stamps[-1])  # NaN is outside
-    if inside.mean() > 0.5:  # the trajectory may start late or end early
-        return stamps
+    are_times = inside.mean() > 0.5  # the trajectory may start late or end early
     if len(clouds) == len(poses.stamps):
-        return poses.stamps
+        if not are_times or np.array_equal(poses.stamps, np.arange(len(clouds))):
+            return poses.stamps
+        _check_order(clouds, stamps, poses)
+    if are_times:
+        return stamps
     raise ValueError(
         f"{poses.source}: {len(poses.stamps)} poses from {poses.stamps[0]:.6f} to "
         f"{poses.stamps[-1]:.6f} s for the {len(clouds)} clouds {clouds[0].name} to "
@@ -116,11 +142,25 @@ def _stamps(clouds: list[Path], poses: TimedPoses) -> np.ndarray:
     )
 
 
+def _check_order(clouds: list[Path], stamps: np.ndarray, poses: TimedPoses) -> None:
+    """Raises if the times of as many poses as clouds disagree with their order.
+
+    They do if one cloud has no pose at its time, and another not the pose of its rank.
+    """
+    rows = [rows_at(poses, stamp, _MAX_GAP) for stamp in stamps]
+    lost = next((path for path, found in zip(clouds, rows, strict=True) if not found), None)
+    if lost and any(found and rank not in found for rank, found in enumerate(rows)):
+        raise ValueError(
+            f"{poses.source}: {len(stamps)} poses for as many clouds, but none at the time of "
+            f"{lost.name}; expected one at the time of each cloud, or the times 0, 1, 2, ... for "
+            "poses in the order of the clouds"
+        )
+
+
 def _stamp(path: Path) -> float:
-    try:
-        value = float(path.stem)
-    except ValueError:
+    if not re.fullmatch(_TIME, path.stem):  # float also takes 1_000, 1e5 and nan
         return float("nan")
+    value = float(path.stem)
     return 1e-9 * value if value >= _NANOSECONDS else value
 
 

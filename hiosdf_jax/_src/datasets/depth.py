@@ -32,12 +32,14 @@ def pinhole(intrinsics: Sequence[float], source: object) -> np.ndarray:
         ValueError: There are not four, one is not finite, or a focal length is not positive.
     """
     values = np.asarray(intrinsics, float)
-    if values.shape != (4,) or not np.isfinite(values).all() or not (values[:2] > 0).all():
+    if values.shape != (4,):
         raise ValueError(
             f"{source}: intrinsics are {values.tolist()}, expected fx, fy > 0, cx, cy in pixels"
         )
     fx, fy, cx, cy = values
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    sensors.check_camera(f"{source}: camera matrix of fx, fy, cx, cy", matrix)
+    return matrix
 
 
 def read_depth(

@@ -137,8 +137,7 @@ class NpzStream:
         depth, matrix = self._arrays["depth"], self._arrays["K"]
         self._expect("depth", ("F", "H", "W"))
         self._expect("K", (3, 3))
-        if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
-            raise ValueError(f"{self.path}: K = {matrix.tolist()}, expected focal lengths > 0")
+        sensors.check_camera(f"{self.path}: K", matrix)
         self._scale = self._positive("depth_scale")
         self._to_cloud = partial(_depth_to_cloud, intrinsics=matrix.astype(np.float32))
         self._check_size(math.prod(depth.shape[1:]))

@@ -37,7 +37,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def _clouds_in(path: Path) -> set[str]:
-    return {each.name for each in path.iterdir() if each.suffix in (".ply", ".pcd")}
+    return {each.name for each in path.iterdir() if each.suffix.lower() in (".ply", ".pcd")}
 
 
 def _has_clouds(path: Path) -> bool:

@@ -2,8 +2,10 @@
 
 The pose of a cloud is the product of the transforms from its frame up to the root of the tf tree,
 each interpolated at the stamp of the cloud. If tf does not contain the motion of the robot, an
-odometry message is the transform from its `header.frame_id` to its `child_frame_id`. Clouds are
-used as recorded, with the motion within a sweep not corrected.
+odometry message is the transform from its `header.frame_id` to its `child_frame_id`. A transform
+that is published again and again but never changes, and a joint below the frame that the odometry
+moves, are not the motion of the robot. Clouds are used as recorded, with the motion within a sweep
+not corrected.
 
 The `rosbags` package reads both kinds of bag without ROS.
 """
@@ -25,8 +27,8 @@ import numpy as np
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 from hiosdf_jax._src.datasets.inflating import limit_rosbags
 from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
-from hiosdf_jax._src.datasets.timed_poses import TimedPoses
-from hiosdf_jax._src.datasets.transforms import Edge, path_up, transform_up
+from hiosdf_jax._src.datasets.timed_poses import TimedPoses, check_unique
+from hiosdf_jax._src.datasets.transforms import Edge, moves, moving, path_up, transform_up
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -38,6 +40,7 @@ _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField's
 
 _Row = tuple[float, Any, Any]  # stamp, translation, rotation
+_Transform = tuple[str, str, bool, _Row]  # child, parent, whether it holds at all times
 
 
 def rosbag_stream(
@@ -54,18 +57,19 @@ def rosbag_stream(
         path: A `.bag`, `.mcap` or `.db3` file, or the folder of a ROS 2 bag.
         cloud_topic: Topic of the PointCloud2 messages; needed if there are several.
         odometry_topic: Topic of Odometry messages, which replace tf for their child frame. By
-            default odometry is used if there is one topic and tf contains no motion.
+            default odometry is used if there is one topic and tf does not contain its motion.
         world_frame: Frame of the map; by default the root of the tf tree.
         poses: Whether to read tf and odometry. If not, each pose is the identity.
 
     Returns:
-        The clouds as a stream. A cloud without transforms at its time is a bad frame. The bag
-        stays open for the lifetime of the stream.
+        The clouds as a stream. A cloud without transforms at its time, or in a frame that has
+        none, is a bad frame. The bag stays open for the lifetime of the stream.
 
     Raises:
         FileNotFoundError: There is no such file.
         NoPosesError: The bag does not contain the motion of the sensor.
-        ValueError: The bag cannot be read, or a topic is missing or ambiguous.
+        ValueError: The bag cannot be read, a topic is missing or ambiguous, tf and odometry may
+            both be the motion of the sensor, or a transform has two poses at one time.
         ModuleNotFoundError: rosbags is not installed.
 
     Example:
@@ -98,32 +102,10 @@ def rosbag_stream(
             times, transforms, odometry, first = _scan(reader, clouds)
         if first is None:
             raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message, expected clouds")
-        if not poses:  # nothing is above the sensor then, and its pose is the identity
-            transforms, odometry, odometry_topic, world_frame = [], {}, None, None
-        edges = _edges(path, transforms)
         sensor = _name(first.header.frame_id)
-        if odometry_topic is None and not _moves(edges, sensor) and len(odometry) == 1:
-            odometry_topic = next(iter(odometry))
-        if odometry_topic is not None:
-            if odometry_topic not in odometry:
-                raise ValueError(
-                    f"{path}: odometry_topic = {odometry_topic!r}, expected one of "
-                    f"{sorted(odometry)}"
-                )
-            moved = _edges(path, odometry[odometry_topic])
-            edges |= moved
-            if moved.keys().isdisjoint(path_up(edges, sensor)):
-                raise NoPosesError(
-                    f"{path}: odometry topic {odometry_topic} moves {list(moved)}, expected one of "
-                    f"{path_up(edges, sensor)}, the frames from the cloud's frame upward"
-                )
-        above = path_up(edges, sensor, world_frame)
-        if poses and world_frame is None and not _moves(edges, sensor):
-            raise NoPosesError(
-                f"{path}: nothing moves above the cloud's frame, {' in '.join(above)}; expected "
-                f"tf, or one of the odometry topics {sorted(odometry)} whose child is one of these "
-                "frames, or a world_frame if the sensor stands still"
-            )
+        edges, above = {}, [sensor]  # without poses nothing is above the sensor
+        if poses:
+            edges, above = _tree(path, transforms, odometry, sensor, odometry_topic, world_frame)
         kept_open = closing.pop_all()
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -136,8 +118,18 @@ def rosbag_stream(
             if returns > most:
                 raise ValueError(f"{returns} returns, expected at most {most}")
             cloud = cloud_of(message)
-        upward = path_up(edges, _name(message.header.frame_id), world_frame)
-        return cloud, transform_up(edges, upward, _seconds(message.header.stamp))
+        return cloud, transform_up(edges, upward(message), _seconds(message.header.stamp))
+
+    def upward(message: Any) -> list[str]:
+        own = _name(message.header.frame_id)
+        if own == sensor:
+            return above
+        if own not in edges or own == above[-1]:
+            raise ValueError(
+                f"{path}, {clouds[0].topic}: cloud in frame {own!r}, which has no transform up to "
+                f"the frame of the map, {above[-1]!r}"
+            )
+        return _unique_path_up(edges, own, above[-1])
 
     stream = FrameStream(path, len(times), frame, [stamp for _, _, stamp in times])
     weakref.finalize(stream, kept_open.close)
@@ -195,7 +187,7 @@ def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection
 
 def _scan(
     reader: AnyReader, clouds: list[Connection]
-) -> tuple[list[tuple[int, int, float]], list[tuple[str, str, bool, _Row]], dict[str, list], Any]:
+) -> tuple[list[tuple[int, int, float]], list[_Transform], dict[str, list[_Transform]], Any]:
     """Reads a bag once, one message at a time.
 
     Returns:
@@ -205,8 +197,8 @@ def _scan(
     """
     wanted = [c for c in reader.connections if c.msgtype in (*_TRANSFORMS, _ODOMETRY)]
     times: list[tuple[int, int, float]] = []
-    transforms: list[tuple[str, str, bool, _Row]] = []
-    odometry: dict[str, list] = defaultdict(list)
+    transforms: list[_Transform] = []
+    odometry: dict[str, list[_Transform]] = defaultdict(list)
     first = None
     for connection, time, raw in reader.messages([*clouds, *wanted]):
         if connection.msgtype == _CLOUD:
@@ -230,7 +222,7 @@ def _scan(
     return times, transforms, odometry, first
 
 
-def _edges(path: Path, transforms: Iterable[tuple[str, str, bool, _Row]]) -> dict[str, Edge]:
+def _edges(path: Path, transforms: Iterable[_Transform]) -> dict[str, Edge]:
     """Groups transforms by child frame; motion takes precedence over a fixed transform."""
     rows: dict[tuple[str, bool], list[_Row]] = defaultdict(list)
     parents: dict[tuple[str, bool], str] = {}
@@ -242,19 +234,139 @@ def _edges(path: Path, transforms: Iterable[tuple[str, str, bool, _Row]]) -> dic
     edges = {}
     for (child, fixed), parent in sorted(parents.items(), key=lambda item: not item[0][1]):
         table = rows[child, fixed]
-        table = table[-1:] if fixed else sorted(table, key=lambda row: row[0])
-        motion = TimedPoses(
-            stamps=np.array([stamp for stamp, _, _ in table]),
-            positions=np.array([(p.x, p.y, p.z) for _, p, _ in table]),
-            quaternions=np.array([(q.x, q.y, q.z, q.w) for _, _, q in table]),
-            source=f"{path}, {child} in {parent}",
-        )
+        motion = _timed(table[-1:] if fixed else table, f"{path}, {child} in {parent}")
         edges[child] = Edge(parent, motion, fixed)
     return edges
 
 
-def _moves(edges: dict[str, Edge], frame: str) -> bool:
-    return any(not edges[child].fixed for child in path_up(edges, frame)[:-1])
+def _timed(rows: list[_Row], source: str) -> TimedPoses:
+    """Sorts poses by time."""
+    rows = sorted(rows, key=lambda row: row[0])
+    return TimedPoses(
+        stamps=np.array([stamp for stamp, _, _ in rows]),
+        positions=np.array([(p.x, p.y, p.z) for _, p, _ in rows]),
+        quaternions=np.array([(q.x, q.y, q.z, q.w) for _, _, q in rows]),
+        source=source,
+    )
+
+
+def _tree(
+    path: Path,
+    transforms: list[_Transform],
+    odometry: dict[str, list[_Transform]],
+    sensor: str,
+    odometry_topic: str | None,
+    world_frame: str | None,
+) -> tuple[dict[str, Edge], list[str]]:
+    """Returns the tree of frames, and the path in it from the sensor up to the map."""
+    if world_frame is not None and not isinstance(world_frame, str):
+        raise ValueError(f"{path}: world_frame is {world_frame!r}, expected a frame's name")
+    world_frame = None if world_frame is None else _name(world_frame)
+    edges = _edges(path, transforms)
+    if odometry_topic is None:
+        odometry_topic = _default_odometry(path, edges, odometry, sensor, world_frame)
+    if odometry_topic is not None:
+        edges |= _odometry_edges(path, edges, odometry, sensor, odometry_topic)
+    to_root = path_up(edges, sensor)
+    if world_frame is not None:
+        _check_world_frame(path, edges, to_root, world_frame)
+    elif odometry_topic is None and not moving(edges, to_root):  # odometry may well stand still
+        raise NoPosesError(
+            f"{path}: nothing moves above the cloud's frame, {' in '.join(to_root)}; expected tf, "
+            f"or one of the odometry topics {sorted(odometry)} whose child is one of these frames, "
+            "or a world_frame if the sensor stands still"
+        )
+    return edges, _unique_path_up(edges, sensor, world_frame)
+
+
+def _odometry_edges(
+    path: Path,
+    edges: dict[str, Edge],
+    odometry: dict[str, list[_Transform]],
+    sensor: str,
+    topic: str,
+) -> dict[str, Edge]:
+    """Returns the edges of an odometry topic, one of them above the sensor."""
+    if topic not in odometry:
+        raise ValueError(f"{path}: odometry_topic = {topic!r}, expected one of {sorted(odometry)}")
+    moved = _edges(path, odometry[topic])
+    above = path_up(edges | moved, sensor)
+    if moved.keys().isdisjoint(above):
+        raise NoPosesError(
+            f"{path}: odometry topic {topic} moves {list(moved)}, expected one of {above}, the "
+            "frames from the cloud's frame upward"
+        )
+    return moved
+
+
+def _check_world_frame(
+    path: Path, edges: dict[str, Edge], to_root: list[str], world_frame: str
+) -> None:
+    """Raises unless a frame can be that of the map, for a sensor with this path to the root."""
+    if world_frame not in to_root:
+        raise ValueError(
+            f"{path}: frame {world_frame!r} is not above {to_root[0]!r}, expected one of "
+            f"{to_root[1:]}"
+        )
+    if world_frame == to_root[0] and moving(edges, to_root):
+        raise ValueError(
+            f"{path}: world_frame = {world_frame!r}, which is the clouds' own and moves; expected "
+            f"one of {to_root[1:]}"
+        )
+
+
+def _unique_path_up(edges: dict[str, Edge], frame: str, top: str | None) -> list[str]:
+    """Calls `path_up`, and checks that no edge on the path has two poses at one time."""
+    path = path_up(edges, frame, top)
+    for child in path[:-1]:
+        if not edges[child].fixed:
+            check_unique(edges[child].motion)
+    return path
+
+
+def _default_odometry(
+    path: Path,
+    edges: dict[str, Edge],
+    odometry: dict[str, list[_Transform]],
+    sensor: str,
+    world_frame: str | None,
+) -> str | None:
+    """Returns the odometry topic that has the motion of the sensor, None if tf has it."""
+    joints = moving(edges, path_up(edges, sensor))
+    if not joints:
+        return next(iter(odometry)) if len(odometry) == 1 else None
+    rivals = [
+        topic
+        for topic, rows in odometry.items()
+        if moves(_timed([row for *_, row in rows], f"{path}, {topic}"))
+    ]
+    known = [_tf_has(edges, sensor, *odometry[topic][0][:2]) for topic in rivals]
+    if not rivals or True in known:
+        return None
+    if known == [False]:
+        return rivals[0]
+    if world_frame is not None:
+        return None
+    raise ValueError(
+        f"{path}: tf moves {joints}, and odometry topics {rivals} move "
+        f"{[odometry[topic][0][0] for topic in rivals]}; expected odometry_topic= or world_frame= "
+        "to choose odometry or tf as the motion of the sensor"
+    )
+
+
+def _tf_has(edges: dict[str, Edge], sensor: str, child: str, parent: str) -> bool | None:
+    """Returns whether tf has the motion of an odometry's child in its parent; None if unknown.
+
+    What moves between the sensor and the child is a joint, such as that of a turning mount.
+    """
+    above, over_child = path_up(edges, sensor), path_up(edges, child)
+    if child in above:
+        return bool(moving(edges, over_child))
+    if over_child[-1] == above[-1]:
+        return True if moving(edges, over_child) else None
+    if parent in above:
+        return bool(moving(edges, path_up(edges, sensor, parent)))
+    return None
 
 
 def _name(frame: str) -> str:

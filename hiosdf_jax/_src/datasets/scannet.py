@@ -1,19 +1,22 @@
 """Frames of a ScanNet scene, as exported by its SensReader.
 
 - `depth/N.png`: 16 bits, mm along the optical axis; x right, y down, z forward.
-- `pose/N.txt`: 4 lines of 4 numbers, T_world_camera; -inf where tracking was lost.
+- `pose/N.txt`: 4 lines of 4 numbers, T_world_camera; -inf where tracking was lost. N is written as
+  in the image's name, or without its leading zeros.
 - `intrinsic/intrinsic_depth.txt`: 4 lines of 4 numbers, K in the upper left.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 from pathlib import Path
 
 import numpy as np
 
-from hiosdf_jax._src.datasets.depth import pinhole, read_depth
+from hiosdf_jax._src.datasets.depth import read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
+from hiosdf_jax._src.datasets.sensors import check_camera
 from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.numerics.intake import check_pose
 
@@ -34,7 +37,8 @@ def scannet_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> Fra
     Raises:
         FileNotFoundError: A file or folder is missing.
         NoPosesError: There is no folder `pose`.
-        ValueError: A file is malformed; the message names it and the line.
+        ValueError: A file is malformed, and the message names it and the line; or a frame has two
+            images.
 
     Example:
         stream = datasets.scannet_stream("scene0000_00")
@@ -42,19 +46,36 @@ def scannet_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> Fra
     """
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")
+    _check_once(images)
     if poses and not (folder / "pose").exists():
         raise NoPosesError(f"{folder}: has no poses, expected them in the folder pose")
     path = folder / "intrinsic" / "intrinsic_depth.txt"
-    values = _matrix(path)
-    matrix = pinhole([values[0, 0], values[1, 1], values[0, 2], values[1, 2]], path)
+    matrix = _matrix(path)[:3, :3]
+    check_camera(f"{path}: camera matrix", matrix)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
-        number, image = images[index]
-        source = folder / "pose" / f"{number}.txt"
-        pose = check_pose(_matrix(source), str(source)) if poses else np.eye(4)
-        return read_depth(image, _SCALE, matrix), pose
+        pose = np.eye(4)
+        if poses:
+            source = _pose_file(folder / "pose", *images[index])
+            pose = check_pose(_matrix(source), str(source))
+        return read_depth(images[index][1], _SCALE, matrix), pose
 
     return FrameStream(folder, len(images), frame)
+
+
+def _check_once(images: list[tuple[int, Path]]) -> None:
+    """Raises if one frame has two images, such as 1.png and 01.png."""
+    for (number, image), (other, twin) in itertools.pairwise(images):
+        if number == other:
+            raise ValueError(
+                f"{image}: is frame {number}, as is {twin.name}, expected one image for a frame"
+            )
+
+
+def _pose_file(folder: Path, number: int, image: Path) -> Path:
+    """The file of an image's pose; where there is none, the name that it should have."""
+    path, plain = folder / f"{image.stem}.txt", folder / f"{number}.txt"
+    return plain if plain.is_file() and not path.exists() else path
 
 
 def _matrix(path: Path) -> np.ndarray:

@@ -7,10 +7,13 @@ Its shape depends on the sensor alone, so one compilation serves a stream.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from hiosdf_jax._src.numerics.intake import as_array
+from hiosdf_jax._src.numerics.intake import as_array, is_traced
+
+_ZERO = 1e-6  # of a camera matrix; files have few digits
 
 
 def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
@@ -25,7 +28,8 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
         for no return.
 
     Raises:
-        ValueError: Depth has fewer than two dimensions or intrinsics is not (3, 3).
+        ValueError: Depth has fewer than two dimensions, or intrinsics is no pinhole matrix. Inside
+            jit only its shape is checked.
 
     Example:
         depth = depth_mm / 1000.0  # (480, 640) m; 0 is not a return
@@ -38,6 +42,8 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
         raise ValueError(f"depth has shape {depth.shape}, expected (..., H, W)")
     if intrinsics.shape != (3, 3):
         raise ValueError(f"intrinsics has shape {intrinsics.shape}, expected (3, 3)")
+    if not is_traced(intrinsics):
+        check_camera("intrinsics", np.asarray(intrinsics))
     height, width = depth.shape[-2:]
     v = (jnp.arange(height) - intrinsics[1, 2])[:, None] / intrinsics[1, 1]
     # K[0, 1] is the skew, 0 for nearly all cameras but part of K.
@@ -45,6 +51,34 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
     directions = jnp.stack([u, jnp.broadcast_to(v, u.shape), jnp.ones_like(u)], axis=-1)
     flat = depth.reshape(*depth.shape[:-2], height * width)
     return _along(flat, directions.reshape(height * width, 3))
+
+
+def check_camera(name: str, matrix: np.ndarray) -> None:
+    """Checks a pinhole matrix.
+
+    Args:
+        name: Name of the matrix in error messages.
+        matrix: (3, 3) K, pixels.
+
+    Raises:
+        ValueError: It is not finite, a focal length is not a positive float32 at full precision,
+            or the zeros and the 1 of a pinhole matrix are something else.
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        rounded = matrix.astype(np.float32)
+    fault = None
+    if not np.isfinite(rounded).all():
+        fault = "finite numbers"
+    elif np.abs(rounded[2, :2]).max() > _ZERO:
+        fault = "0, 0, 1 in the last row; is it transposed?"
+    elif not (rounded[[0, 1], [0, 1]] >= np.finfo(np.float32).tiny).all():
+        fault = "focal lengths > 0"
+    elif np.abs(rounded[2, 2] - 1) > _ZERO:
+        fault = "0, 0, 1 in the last row; is it scaled?"
+    elif np.abs(rounded[1, 0]) > _ZERO:
+        fault = "0 left of the second focal length"
+    if fault is not None:
+        raise ValueError(f"{name} is {matrix.tolist()}, expected {fault}")
 
 
 def ranges_to_cloud(ranges: ArrayLike, directions: ArrayLike) -> Array:

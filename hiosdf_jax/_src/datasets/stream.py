@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from hiosdf_jax._src.numerics.intake import check_pose, cloud_and_returns
+from hiosdf_jax._src.numerics.intake import as_number, check_pose, cloud_and_returns
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 
 _POINTS_PER_FRAME = 5000  # drawn from each cloud
@@ -219,7 +219,7 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
 
     Raises:
         BadFrameError: A frame is bad and `skip_bad_frames` is False.
-        ValueError: Margin is negative, or no frame is usable.
+        ValueError: Margin is no number, or negative; or no frame is usable.
 
     Example:
         extent = datasets.find_bounds(stream)
@@ -227,8 +227,7 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
     """
     from tqdm import tqdm
 
-    if not margin >= 0:
-        raise ValueError(f"margin = {margin} m, expected >= 0")
+    margin = as_number("margin", margin, 0)
     rng = np.random.default_rng(0)
     frames, points, ranges, path = [], [], [], []
     for i in tqdm(range(len(stream)), desc="finding bounds", unit="frame"):

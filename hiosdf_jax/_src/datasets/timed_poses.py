@@ -63,15 +63,31 @@ def read_timed_poses(path: str | os.PathLike[str]) -> TimedPoses:
             f"{path}, line {lines[i]}: time {rows[i, 0]:.6f} s after {rows[i - 1, 0]:.6f} s, "
             "expected times that never decrease"
         )
-    same = np.diff(rows[:, 0]) == 0
-    twice = np.flatnonzero(same & (np.diff(rows[:, 1:], axis=0) != 0).any(axis=1))
+    poses = TimedPoses(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
+    check_unique(poses)
+    return poses
+
+
+def check_unique(poses: TimedPoses) -> None:
+    """Checks that there is one pose at a time; it may be repeated.
+
+    Args:
+        poses: The poses.
+
+    Raises:
+        ValueError: Two poses at one time differ. The message names the source, and the lines if
+            it is a file.
+    """
+    values = np.hstack([poses.positions, poses.quaternions])
+    same = np.diff(poses.stamps) == 0
+    twice = np.flatnonzero(same & (np.diff(values, axis=0) != 0).any(axis=1))
     if len(twice):
         i = twice[0] + 1
+        than = "" if poses.lines is None else f" than in line {poses.lines[i - 1]}"
         raise ValueError(
-            f"{path}, line {lines[i]}: another pose at {rows[i, 0]:.6f} s than in line "
-            f"{lines[i - 1]}, expected one pose at a time"
+            f"{poses.place(i)}: another pose at {poses.stamps[i]:.6f} s{than}, expected one pose "
+            "at a time"
         )
-    return TimedPoses(rows[:, 0], rows[:, 1:4], rows[:, 4:8], str(path), lines)
 
 
 def pose_at(poses: TimedPoses, stamp: float, max_gap: float) -> np.ndarray:
@@ -93,25 +109,42 @@ def pose_at(poses: TimedPoses, stamp: float, max_gap: float) -> np.ndarray:
     from scipy.spatial.transform import Rotation, Slerp
 
     stamps = poses.stamps
+    rows = rows_at(poses, stamp, max_gap)
+    if not rows:
+        raise ValueError(
+            f"{poses.source}: no pose for {stamp:.6f} s; the nearest is "
+            f"{np.abs(stamps - stamp).min():.3f} s away, expected one within {_NEAR} s, or poses "
+            f"on both sides at most {max_gap} s apart"
+        )
+    positions, rotations = zip(*(_checked(poses, i) for i in rows), strict=True)
+    position, rotation = positions[0], rotations[0]
+    if len(rows) == 2:
+        share = (stamp - stamps[rows[0]]) / np.ptp(stamps[rows])
+        position = (1 - share) * positions[0] + share * positions[1]
+        rotation = Slerp([0, 1], Rotation.concatenate(rotations))(share)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
+
+
+def rows_at(poses: TimedPoses, stamp: float, max_gap: float) -> list[int]:
+    """Finds the poses that `pose_at` uses for a time.
+
+    Args:
+        poses: The poses.
+        stamp: s.
+        max_gap: s, as for `pose_at`.
+
+    Returns:
+        Indices: of the two poses to interpolate, of one that is used as it is, or none.
+    """
+    stamps = poses.stamps
     after = int(np.searchsorted(stamps, stamp))
     around = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
     nearest = min(around, key=lambda i: abs(stamps[i] - stamp))
     if len(around) == 2 and stamps[nearest] != stamp and np.ptp(stamps[around]) <= max_gap:
-        positions, rotations = zip(*(_checked(poses, i) for i in around), strict=True)
-        share = (stamp - stamps[around[0]]) / np.ptp(stamps[around])
-        position = (1 - share) * positions[0] + share * positions[1]
-        rotation = Slerp([0, 1], Rotation.concatenate(rotations))(share)
-    elif abs(stamps[nearest] - stamp) <= _NEAR:
-        position, rotation = _checked(poses, nearest)
-    else:
-        raise ValueError(
-            f"{poses.source}: no pose for {stamp:.6f} s; the nearest is "
-            f"{abs(stamps[nearest] - stamp):.3f} s away, expected one within {_NEAR} s, or poses "
-            f"on both sides at most {max_gap} s apart"
-        )
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
-    return pose
+        return around
+    return [nearest] if abs(stamps[nearest] - stamp) <= _NEAR else []
 
 
 def _checked(poses: TimedPoses, index: int):  # noqa: ANN202, scipy is imported when used
