@@ -17,6 +17,7 @@ CLOUDS = RNG.uniform(-4, 4, (FRAMES, 30, 3)).astype(np.float32)
 POSES = np.tile(np.eye(4), (FRAMES, 1, 1))
 POSES[:, :3, :3] = Rotation.random(FRAMES, random_state=RNG).as_matrix()
 POSES[:, :3, 3] = RNG.uniform(-2, 2, (FRAMES, 3))
+IDENTITIES = np.tile(np.eye(4), (FRAMES, 1, 1))  # poses that are not read
 
 
 def write_png(path, raw):

@@ -7,14 +7,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.image import imread
-from room import room_cloud
+from room import CONFIG, room_cloud
 from room_files import BOX, use_room_config
 from scipy.spatial.transform import Rotation
 
+import hiosdf_jax as hio
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.command import cli, map_stream, tracker
-from hiosdf_jax._src.command.tracker import TRAJECTORY, without_flips
+from hiosdf_jax._src.command.inputs import find_bounds_around_start
+from hiosdf_jax._src.command.tracker import TRAJECTORY, Tracker, continued, without_flips
+from hiosdf_jax._src.datasets.stream import BadFrameError, FrameStream
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
 from hiosdf_jax._src.mapping.registration.refining import Registration
 
@@ -38,14 +42,26 @@ def walk():
     return (np.stack(part) for part in zip(*frames, strict=True))
 
 
-def write(path, clouds, poses):
+def write(path, clouds, **arrays):
     np.savez(
         path,
-        poses=poses,
+        **arrays,
         points_mm=np.rint(1000 * clouds.reshape(-1, 3)).astype(np.int16),
         offsets=clouds.shape[1] * np.arange(len(clouds) + 1),
     )
     return str(path)
+
+
+def write_folder(folder, clouds, names):
+    folder.mkdir()
+    for cloud, name in zip(clouds, names, strict=True):
+        trimesh.PointCloud(cloud).export(folder / f"{name}.ply")
+    return str(folder)
+
+
+def from_first(poses):
+    """Poses (F, 4, 4) in the frame of the first one."""
+    return np.linalg.inv(poses[0]) @ poses
 
 
 def drifting(poses):
@@ -80,7 +96,7 @@ def way_cm(poses, exact):
 def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     clouds, exact = walk()
     given = drifting(exact)
-    stream = write(tmp_path / "walk.npz", clouds, given)
+    stream = write(tmp_path / "walk.npz", clouds, poses=given)
     output, saved = tmp_path / "out", tmp_path / "map.npz"
     arguments = ["map", stream, *options, "--output", str(output), "--save", str(saved), *BOX]
     assert cli.main(arguments) == 0
@@ -88,6 +104,7 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     with np.load(output / "trajectory.npz") as file:
         poses, covariance, registered = file["poses"], file["covariance"], file["registered"]
         np.testing.assert_array_equal(file["frame"], np.arange(FRAMES))
+        np.testing.assert_array_equal(file["time"], np.arange(FRAMES))
     assert registered[0]
     assert registered[CONFIDENT_UPDATES:].all()
     assert way_cm(given, exact).max() > 6.9
@@ -109,11 +126,137 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     assert "does not say how far the map has come" in capsys.readouterr().err
 
 
+def test_a_file_without_poses_is_mapped_by_odometry(tmp_path, quick):
+    clouds, exact = walk()
+    stamps = 1.7e9 + 0.1 * np.arange(FRAMES) ** 1.1
+    stream, output = write(tmp_path / "walk.npz", clouds, stamp=stamps), tmp_path / "out"
+    arguments = ["map", stream, "--odometry", "--output", str(output), *BOX]
+    assert cli.main([*arguments, "--frames", "14"]) == 0
+    with np.load(output / "trajectory.npz") as file:
+        assert way_cm(file["poses"], from_first(exact)[:14]).max() < 3
+        np.testing.assert_array_equal(file["poses"][0], np.eye(4))
+        np.testing.assert_array_equal(file["time"], stamps[:14])
+    text = output / "trajectory.txt"
+    np.testing.assert_allclose(read_timed_poses(text).stamps, stamps[:14], rtol=1e-15)
+    assert text.read_text().startswith("# time tx")
+    assert imread(output / "trajectory.png").std() > 0.05
+
+
+def test_a_folder_of_clouds_without_poses_is_mapped_by_odometry(
+    tmp_path, quick, capsys, monkeypatch
+):
+    """Neither poses nor bounds; the names are the times, in nanoseconds."""
+    clouds, exact = walk()
+    boxes = []
+
+    def light(cls, bounds, **_):
+        boxes.append(bounds)
+        return CONFIG  # compiled already
+
+    monkeypatch.setattr(hio.Config, "light", classmethod(light))
+    names = 1_700_000_000_000_000_000 + 123_456_789 * np.arange(FRAMES)
+    stream, output = write_folder(tmp_path / "scans", clouds, names), tmp_path / "out"
+    assert cli.main(["map", stream, "--odometry", "--output", str(output)]) == 0
+    text = capsys.readouterr().out
+    assert "mapping 3 m around what it sees from its first position (--bounds sets" in text
+    timed = read_timed_poses(output / "trajectory.txt")
+    np.testing.assert_allclose(timed.stamps, 1e-9 * names, rtol=0, atol=1e-6)
+    found = np.stack([pose_at(timed, stamp, 0.1) for stamp in timed.stamps])
+    assert way_cm(found, from_first(exact)).max() < 3
+    metrics = json.loads((output / "metrics.json").read_text("utf-8"))
+    assert (metrics["updates"], metrics["flags"]) == (FRAMES, [])
+    low, high = np.array(boxes[-1])
+    seen = np.concatenate(clouds)  # walls at 0.97, 0.78 and 0.56 m
+    np.testing.assert_allclose(low, seen.min(axis=0) - 3, atol=0.1)
+    np.testing.assert_allclose(high, seen.max(axis=0) + 3, atol=0.1)
+
+
+@pytest.mark.parametrize("options", [[], ["--refine-poses"]], ids=str)
+@pytest.mark.parametrize("kind", ["npz", "clouds"])
+def test_a_stream_without_poses_needs_odometry(tmp_path, capsys, kind, options):
+    clouds = [np.ones((4, 3))] * 2
+    if kind == "npz":
+        stream = write(tmp_path / "walk.npz", np.stack(clouds))
+    else:
+        stream = write_folder(tmp_path / "scans", clouds, range(2))
+    arguments = ["map", stream, *options, "--output", str(tmp_path / "out"), *BOX]
+    assert cli.main(arguments) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"hiosdf: {stream}: has no poses, expected ")
+    assert last.endswith("; --odometry maps a stream without poses")
+
+
+def test_exact_distances_need_poses(tmp_path, capsys):
+    stream, scene = write(tmp_path / "walk.npz", np.ones((2, 4, 3))), tmp_path / "scene.ply"
+    trimesh.creation.box().export(scene)
+    arguments = ["map", stream, "--odometry", "--ground-truth", str(scene), *BOX]
+    assert cli.main([*arguments, "--output", str(tmp_path / "out")]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"hiosdf: {stream}: has no poses")
+    assert last.endswith(": --ground-truth needs poses")
+
+
+def test_bounds_do_not_come_from_poses_that_odometry_ignores():
+    """A LiDAR that is turned by 90 degrees, and a camera; poses after the first are far off."""
+    pose, lost = np.eye(4), np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    pose[:3, 3] = [10, 20, 1]
+    lost[:3, 3] = 500
+    rng = np.random.default_rng(0)
+    around = rng.uniform([-6, -4, -1], [6, 4, 2], (5000, 3)).astype(np.float32)
+    frames = [(around, pose), (around, lost)]
+    found = find_bounds_around_start(FrameStream("lidar", 2, frames.__getitem__))
+    np.testing.assert_allclose(found.bounds, [[3, 11, -3], [17, 29, 6]], atol=0.1)
+    assert 6.5 < found.max_range < 7.5
+    ahead = rng.uniform([-1, -1, 1], [1, 1, 5], (5000, 3)).astype(np.float32)
+    frames = [(np.full((9, 3), np.nan), lost), (ahead, pose), (ahead, lost)]
+    camera = FrameStream("camera", 3, frames.__getitem__)
+    with pytest.raises(BadFrameError, match=r"^frame 0: cloud has no finite row"):
+        find_bounds_around_start(camera)
+    found = find_bounds_around_start(camera, skip_bad_frames=True)
+    np.testing.assert_allclose(found.bounds, [[2, 12, -7], [18, 28, 9]], atol=0.1)
+
+
+def screw(seconds):
+    """The pose of a sensor that drives on a helix."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("ZX", [0.3 * seconds, 0.2]).as_matrix()
+    pose[:3, 3] = [2 * np.sin(0.3 * seconds), -2 * np.cos(0.3 * seconds), 0.1 * seconds]
+    return pose
+
+
+@pytest.mark.parametrize("ahead", [0.5, 1, 2.3, 4])
+def test_a_motion_is_continued_for_as_long_as_the_next_frame_needs(ahead):
+    found = continued(screw(1), screw(1.2), ahead)
+    expected = screw(1.2 + 0.2 * ahead)
+    np.testing.assert_allclose(found[:3, :3], expected[:3, :3], atol=1e-5)
+    np.testing.assert_allclose(found[:3, 3], expected[:3, 3], atol=1e-3)  # of 0.5 m
+
+
+@pytest.mark.parametrize(
+    ("stamps", "seconds"),
+    [
+        (None, 0.5),  # frames 3 and 4 are missing
+        ([0, 0.1, 0.2, 0.3, 0.4, 0.7], 0.7),
+        ([0, 0.1, 0.2, 0.3, 0.4, 9], 0.7),  # five times the last motion at most
+        ([0, 0.2, 0.1, 0.3, 0.4, 0.7], 0.5),  # no times: they decrease
+        ([0, 0.1, 0.2, 0.3, 0.4, np.nan], 0.5),
+    ],
+)
+def test_the_velocity_is_kept_over_missing_frames(stamps, seconds):
+    tracked = Tracker(odometry=True, stamps=None if stamps is None else np.array(stamps, float))
+    for frame in (1, 2):
+        pose = screw(0.1 * frame)
+        found = Registration(pose, np.eye(6), 0.0, 0.0, True)
+        tracked._add(frame, np.eye(4), pose, found)
+    np.testing.assert_allclose(tracked.predict(np.eye(4), 5), screw(seconds), atol=1e-3)
+
+
 def test_a_stream_that_is_lost_says_since_when(tmp_path, quick, capsys):
     clouds, exact = walk()
     for i in (7, *range(10, FRAMES)):
         clouds[i] = np.random.default_rng(i).normal(size=clouds[i].shape)
-    stream, output = write(tmp_path / "walk.npz", clouds, exact), tmp_path / "out"
+    stream, output = write(tmp_path / "walk.npz", clouds, poses=exact), tmp_path / "out"
     assert cli.main(["map", stream, "--refine-poses", "--output", str(output), *BOX]) == 0
     metrics = json.loads((output / "metrics.json").read_text("utf-8"))
     assert (metrics["frames_not_registered"], metrics["lost_since"]) == (FRAMES - 9, 10)
@@ -123,7 +266,7 @@ def test_a_stream_that_is_lost_says_since_when(tmp_path, quick, capsys):
 def test_a_frame_of_another_place_is_left_out(tmp_path, quick):
     clouds, exact = walk()
     clouds[12] = np.random.default_rng(0).normal(size=clouds[14].shape)
-    stream = write(tmp_path / "walk.npz", clouds, exact)
+    stream = write(tmp_path / "walk.npz", clouds, poses=exact)
     output = tmp_path / "out"
     assert cli.main(["map", stream, "--refine-poses", "--output", str(output), *BOX]) == 0
     with np.load(output / "trajectory.npz") as file:

@@ -9,6 +9,7 @@ import trimesh
 from recordings import (
     CLOUDS,
     FRAMES,
+    IDENTITIES,
     POSES,
     check_bad,
     check_stream,
@@ -17,7 +18,7 @@ from recordings import (
     write_text,
 )
 
-from hiosdf_jax.datasets import BadFrameError, open_stream, read_frame
+from hiosdf_jax.datasets import BadFrameError, NoPosesError, open_stream, read_frame
 
 
 def write_clouds(folder, names, suffix=".ply"):
@@ -143,7 +144,7 @@ def test_bad_clouds(tmp_path, suffix, kind):
 
 def test_clouds_without_poses(tmp_path):
     folder = write_clouds(tmp_path, [1, 2, 3, 4])
-    with pytest.raises(ValueError, match=r"trajectory is one of \[\], expected one \.txt or"):
+    with pytest.raises(NoPosesError, match=r"has no poses, expected a trajectory in a \.txt or"):
         open_stream(folder)
     write_poses(folder / "poses.txt", [2, 2.9, 3.05, 5])
     # By time, 2 has the first pose; by order, the second.
@@ -174,6 +175,29 @@ def test_clouds_without_poses(tmp_path):
     with pytest.raises(ValueError, match=r"trajectory is one of \['more\.txt', 'poses\.txt'\]"):
         open_stream(folder)
     assert len(open_stream(folder, trajectory=folder / "more.txt")) == 4
+
+
+@pytest.mark.parametrize(
+    ("names", "stamps"),
+    [
+        (["9.5", "10", "10.25", "11"], [9.5, 10, 10.25, 11]),
+        (
+            [1403636579763555584 + 10**8 * i for i in range(4)],
+            1403636579.763555584 + 0.1 * np.arange(4),
+        ),
+        (["scan_2", "scan_10", "scan_11", "scan_20"], [np.nan] * 4),
+    ],
+)
+def test_clouds_whose_poses_are_not_read(tmp_path, names, stamps):
+    stream = open_stream(write_clouds(tmp_path, names), poses=False)
+    check_stream(stream, CLOUDS, IDENTITIES)
+    np.testing.assert_allclose(stream.stamps, stamps, rtol=1e-15)
+
+
+def test_times_of_clouds_are_those_of_their_poses(tmp_path):
+    folder = write_clouds(tmp_path, ["a", "b", "c", "d"])
+    write_poses(folder / "poses.txt", [7, 8, 9, 10])
+    np.testing.assert_array_equal(open_stream(folder).stamps, [7, 8, 9, 10])
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from recordings import CLOUDS, POSES, check_bad, check_stream, edit_line, write_text
+from recordings import CLOUDS, IDENTITIES, POSES, check_bad, check_stream, edit_line, write_text
 
-from hiosdf_jax.datasets import BadFrameError, kitti_stream, open_stream, read_frame
+from hiosdf_jax.datasets import BadFrameError, NoPosesError, kitti_stream, open_stream, read_frame
 
 
 def write_kitti(folder):
@@ -61,6 +61,22 @@ def test_bad_files(tmp_path):
         with pytest.raises(ValueError, match=message):
             kitti_stream(folder)
     (folder / "poses.txt").unlink()
-    with pytest.raises(FileNotFoundError) as error:
+    with pytest.raises(NoPosesError) as error:
         kitti_stream(folder)
-    assert str(error.value.filename) == str(tmp_path / "poses" / "07.txt")
+    assert str(tmp_path / "poses" / "07.txt") in str(error.value)
+
+
+def test_without_poses_the_world_is_that_of_the_scanner(tmp_path):
+    folder = write_kitti(tmp_path)
+    (folder / "poses.txt").unlink()
+    (folder / "calib.txt").unlink()
+    check_stream(open_stream(folder, poses=False), CLOUDS, IDENTITIES)
+
+
+def test_times_of_scans(tmp_path):
+    folder = write_kitti(tmp_path)
+    assert kitti_stream(folder).stamps is None
+    write_text(folder / "times.txt", ["0.000000e+00"], ["1.037e-01"], ["2.074e-01"])
+    (folder / "velodyne" / "000001.bin").unlink()  # the other scans keep their numbers
+    for poses in (True, False):
+        np.testing.assert_array_equal(kitti_stream(folder, poses=poses).stamps, [0, 0.2074, np.nan])

@@ -112,6 +112,26 @@ def test_a_stream_is_a_sequence(tmp_path):
     np.testing.assert_array_equal(stream[0][1], POSES[0])
 
 
+@pytest.mark.parametrize("arrays", [DEPTH, RANGE, POINTS], ids=lambda each: list(each)[1])
+def test_poses_that_are_not_read(tmp_path, arrays):
+    with_poses = NpzStream(write(tmp_path, arrays))
+    for poses in (None, POSES[:2]):
+        stream = NpzStream(write(tmp_path, arrays, poses=poses), poses=False)
+        assert len(stream) == 3
+        for (cloud, pose), (expected, _) in zip(stream, with_poses, strict=True):
+            np.testing.assert_array_equal(cloud, expected)
+            np.testing.assert_array_equal(pose, np.eye(4))
+            assert pose.dtype == np.float32
+
+
+def test_times_of_frames(tmp_path):
+    assert NpzStream(write(tmp_path, POINTS)).stamps is None
+    stamps = 1.7e9 + np.array([0, 0.1, 0.3])
+    np.testing.assert_array_equal(NpzStream(write(tmp_path, POINTS, stamp=stamps)).stamps, stamps)
+    with pytest.raises(ValueError, match=r"stamp has shape \(2,\), expected \(3,\)"):
+        NpzStream(write(tmp_path, POINTS, stamp=stamps[:2]))
+
+
 def test_a_bad_pose_is_a_bad_frame(tmp_path):
     poses = POSES.copy()
     poses[1, 0, 0] = np.nan
@@ -129,7 +149,7 @@ def test_a_bad_pose_is_a_bad_frame(tmp_path):
         (DEPTH, {"depth": None}, "has none of the keys"),
         (DEPTH, {"points_mm": POINTS["points_mm"]}, r"has \['depth', 'points_mm'\] of the keys"),
         (DEPTH, {"K": None}, "key 'K' is missing"),
-        (DEPTH, {"poses": None}, "key 'poses' is missing"),
+        (DEPTH, {"poses": None}, "has no poses, expected the key 'poses'"),
         (DEPTH, {"depth_scale": None}, "key 'depth_scale' is missing"),
         (DEPTH, {"depth_scale": np.float32(0)}, "depth_scale = 0.0, expected a number > 0"),
         (DEPTH, {"depth_scale": np.ones(3)}, r"depth_scale has shape \(3,\), expected \(\)"),

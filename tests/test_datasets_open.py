@@ -27,5 +27,7 @@ def test_unknown_and_ambiguous_layouts(tmp_path):
     assert len(open_stream(tmp_path, "tum", intrinsics=INTRINSICS)) == FRAMES
     with pytest.raises(ValueError, match="intrinsics is not an option of format 'scannet'"):
         open_stream(tmp_path, "scannet", intrinsics=INTRINSICS)
+    with pytest.raises(ValueError, match=r"expected one of \[\]$"):
+        open_stream(tmp_path, "scannet", trajectory="poses.txt")
     with pytest.raises(ValueError, match="format = 'TUM', expected one of"):
         open_stream(tmp_path, "TUM")

@@ -11,6 +11,7 @@ from recordings import (
     FRAMES,
     FX,
     FY,
+    IDENTITIES,
     POSES,
     RAW,
     backproject,
@@ -21,7 +22,7 @@ from recordings import (
     write_text,
 )
 
-from hiosdf_jax.datasets import open_stream, read_frame, replicacad_stream
+from hiosdf_jax.datasets import NoPosesError, open_stream, read_frame, replicacad_stream
 
 
 def write_replicacad(folder):
@@ -51,6 +52,15 @@ def test_sequences_of_nice_slam(tmp_path):
     info["camera"]["scale"] = 6553.5
     (tmp_path / "cam_params.json").write_text(json.dumps({"camera": info["camera"]}))
     check_stream(open_stream(folder), [backproject(raw, 6553.5) for raw in RAW], POSES)
+
+
+def test_sequences_without_poses(tmp_path):
+    folder = write_replicacad(tmp_path)
+    (folder / "traj.txt").unlink()
+    with pytest.raises(NoPosesError, match=r"has no poses, expected them in traj\.txt"):
+        replicacad_stream(folder)
+    stream = open_stream(folder, "replicacad", poses=False)  # "results" alone says little
+    check_stream(stream, [backproject(raw, 3276.75) for raw in RAW], IDENTITIES)
 
 
 def test_bad_frames(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hiosdf_jax._src.datasets.rosbag import cloud_of
-from hiosdf_jax.datasets import BadFrameError, find_bounds, open_stream, read_frame
+from hiosdf_jax.datasets import BadFrameError, NoPosesError, find_bounds, open_stream, read_frame
 
 rosbags = pytest.importorskip("rosbags")
 from rosbags.rosbag1 import Writer as Writer1
@@ -298,6 +298,20 @@ def test_bags_without_motion_or_clouds(tmp_path):
     path = write_bag(tmp_path / "blind", "ros1", clouds=False)
     with pytest.raises(ValueError, match=r"cloud_topic = None, expected one of \[\]"):
         open_stream(path)
+
+
+@pytest.mark.parametrize("moving", ["", "tf", "odometry"])
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_bags_whose_poses_are_not_read(tmp_path, kind, moving):
+    path = write_bag(tmp_path / "drive", kind, moving=moving, static=moving == "tf")
+    if moving != "tf":
+        with pytest.raises(NoPosesError):
+            open_stream(path)
+    stream = open_stream(path, poses=False)
+    np.testing.assert_allclose(stream.stamps, STAMPS, rtol=1e-15)  # not when they were recorded
+    for i in range(5):
+        np.testing.assert_array_equal(stream[i][0], CLOUDS[i])
+        np.testing.assert_array_equal(stream[i][1], np.eye(4))
 
 
 def test_clouds_recorded_at_the_same_time(tmp_path):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import struct
 import tracemalloc
 import zlib
@@ -9,6 +10,7 @@ import zlib
 import numpy as np
 import pytest
 from recordings import (
+    IDENTITIES,
     POSES,
     RAW,
     backproject,
@@ -19,12 +21,21 @@ from recordings import (
     write_text,
 )
 
-from hiosdf_jax.datasets import open_stream, scannet_stream
+from hiosdf_jax.datasets import NoPosesError, open_stream, scannet_stream
 
 
 def test_exported_frames(tmp_path):
     stream = open_stream(write_scannet(tmp_path))
     check_stream(stream, [backproject(raw, 1000) for raw in RAW], POSES)
+
+
+def test_frames_without_poses(tmp_path):
+    folder = write_scannet(tmp_path)
+    shutil.rmtree(folder / "pose")
+    with pytest.raises(NoPosesError, match="has no poses, expected them in the folder pose"):
+        open_stream(folder)
+    clouds = [backproject(raw, 1000) for raw in RAW]
+    check_stream(open_stream(folder, poses=False), clouds, IDENTITIES)
 
 
 @pytest.mark.parametrize("folders", [["depth", "pose"], ["depth"]])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hiosdf_jax.datasets import BadFrameError, find_bounds
+from hiosdf_jax.datasets import BadFrameError, FrameStream, find_bounds
 
 
 class Room:
@@ -33,6 +33,15 @@ class Room:
 
     def __getitem__(self, index):
         return self.frames[index]
+
+
+def test_stamps_of_a_stream():
+    room = Room()
+    assert FrameStream("room", 4, room.__getitem__).stamps is None
+    stream = FrameStream("room", 4, room.__getitem__, [0, 0.5, 1, 2])
+    np.testing.assert_array_equal(stream.stamps, [0, 0.5, 1, 2])
+    with pytest.raises(ValueError, match=r"room: stamps has shape \(3,\), expected \(4,\)"):
+        FrameStream("room", 4, room.__getitem__, [0, 0.5, 1])
 
 
 def test_bounds_of_a_room():

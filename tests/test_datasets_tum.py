@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from recordings import (
+    IDENTITIES,
     INTRINSICS,
     POSES,
     RAW,
@@ -13,7 +14,7 @@ from recordings import (
     write_tum,
 )
 
-from hiosdf_jax.datasets import open_stream, tum_stream
+from hiosdf_jax.datasets import NoPosesError, open_stream, tum_stream
 
 
 def test_sequences(tmp_path):
@@ -23,6 +24,16 @@ def test_sequences(tmp_path):
     check_stream(stream, [backproject(raw, 5000) for raw in RAW], POSES, atol=1e-4)
     with pytest.raises(ValueError, match="unknown camera, expected intrinsics or a folder"):
         open_stream(folder)
+
+
+def test_images_without_poses_have_times(tmp_path):
+    folder = write_tum(tmp_path)
+    (folder / "groundtruth.txt").unlink()
+    with pytest.raises(NoPosesError, match=r"has no poses, expected them in groundtruth\.txt"):
+        open_stream(folder, intrinsics=INTRINSICS)
+    stream = open_stream(folder, intrinsics=INTRINSICS, poses=False)
+    check_stream(stream, [backproject(raw, 5000) for raw in RAW], IDENTITIES)
+    np.testing.assert_allclose(stream.stamps, 1305031453.3741 + 0.03 * np.arange(4), rtol=1e-15)
 
 
 @pytest.mark.parametrize(

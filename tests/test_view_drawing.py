@@ -64,3 +64,16 @@ def test_a_path_is_drawn_from_above_and_not_mirrored(tmp_path, monkeypatch, up):
     save_paths(tmp_path / "path.png", path, path, np.ones(3, bool), np.ones(3), up)
     (x, y) = (np.diff(values) for values in drawn[0])
     assert x[0] * y[1] - x[1] * y[0] > 0
+
+
+def test_a_path_without_given_poses_is_drawn_alone(tmp_path, monkeypatch):
+    labels, plot = [], Axes.plot
+
+    def note(self, *values, **options):
+        labels.append(options["label"])
+        return plot(self, *values, **options)
+
+    monkeypatch.setattr(Axes, "plot", note)
+    path, up = np.arange(9.0).reshape(3, 3), np.array([0, 0, 1.0])
+    save_paths(tmp_path / "path.png", None, path, np.ones(3, bool), np.ones(3), up)
+    assert labels == ["refined by the map", "start", "standard deviation in the map"]

@@ -53,6 +53,8 @@ examples:
   hiosdf map drive/ --refine-poses --drift 0.01 0.2
       poses that drift by 1 % of the distance traveled and 0.2 degrees per meter: also writes
       trajectory.txt, trajectory.npz and trajectory.png
+  hiosdf map scans/ --odometry
+      clouds without poses: the world of the map is the sensor at the first frame
 
 The folder gets metrics.json, slices.png, mesh.ply and mesh.png. The map is scored against the
 exact distances of the .npz file (eval_*) or of --ground-truth. Without either it is scored on
@@ -290,8 +292,8 @@ def _add_pose_options(map_: argparse.ArgumentParser) -> None:
     poses.add_argument(
         "--odometry",
         action="store_true",
-        help="use only the first pose of the stream, and register the other frames to the map; "
-        "between frames the motion may change by about 10 cm and 5 degrees",
+        help="use only the first pose of the stream, if it has poses, and register the other "
+        "frames to the map; between frames the motion may change by about 10 cm and 5 degrees",
     )
     map_.add_argument(
         "--drift",
@@ -310,7 +312,8 @@ def _add_size_options(map_: argparse.ArgumentParser) -> None:
         type=float,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="mapped box, m, world frame (default: found in a first reading of the stream)",
+        help="mapped box, m, world frame (default: found in a first reading of the stream; with "
+        "--odometry 3 m around what the sensor sees from its first position)",
     )
     size.add_argument(
         "--voxel-size", type=float, metavar="M", help="edge of a voxel, m (default: 0.1)"

@@ -28,6 +28,7 @@ from hiosdf_jax._src.command.inputs import (
     resumed_map,
     sample_truth,
     seed_of,
+    stamps_of,
 )
 from hiosdf_jax._src.command.outputs import check_folder, check_outputs, is_map
 from hiosdf_jax._src.command.run import run_mapping
@@ -38,6 +39,7 @@ from hiosdf_jax._src.output_files import check_output, replacing_together
 # Heavy imports are inside the functions, so that `hiosdf --help` responds at once.
 if TYPE_CHECKING:
     from hiosdf_jax._src.command.tracker import Tracker
+    from hiosdf_jax._src.datasets.stream import Stream
 
 _NOT_REACHED = 1  # exit code
 _OUTPUT = Path("hiosdf_output")
@@ -209,16 +211,16 @@ def _map(options: argparse.Namespace) -> None:
         exact_sdf=exact_sdf,
         skip_bad_frames=options.skip_bad_frames,
         resumed=resumed,
-        tracker=_tracker(options),
+        tracker=_tracker(options, stream),
     )
 
 
-def _tracker(options: argparse.Namespace) -> Tracker | None:
+def _tracker(options: argparse.Namespace, stream: Stream) -> Tracker | None:
     if not (options.odometry or options.refine_poses):
         return None
     from hiosdf_jax._src.command.tracker import Tracker
 
-    return Tracker(options.odometry, options.drift)
+    return Tracker(options.odometry, options.drift, stamps_of(stream))
 
 
 def _view(options: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -17,36 +18,72 @@ if TYPE_CHECKING:
 
     from hiosdf_jax._src.command.progress import SavedMap
     from hiosdf_jax._src.config import Config
-    from hiosdf_jax._src.datasets.stream import Stream
+    from hiosdf_jax._src.datasets.stream import Extent, Stream
     from hiosdf_jax._src.datasets.truth import GroundTruth
+
+_AROUND_M = 3  # of the box that is mapped where no poses say how far the sensor moves
 
 
 def open_inputs(options: argparse.Namespace) -> tuple[Stream, GroundTruth | None]:
     """Opens the stream, with the exact distances of its file unless others are given."""
     from hiosdf_jax._src.datasets.npz import NpzStream, read_truth
-    from hiosdf_jax._src.datasets.open import open_stream
     from hiosdf_jax._src.datasets.stream import FrameStream
+
+    stream, has_poses = _open(options)
+    truth = None
+    # Without poses nobody knows where the map is among exact distances.
+    if isinstance(stream, NpzStream) and options.ground_truth is None and has_poses:
+        truth = checked(lambda: read_truth(options.stream))
+    if options.frames is not None:
+        count = min(options.frames, len(stream))
+        stamps = stamps_of(stream)
+        stamps = None if stamps is None else stamps[:count]
+        stream = FrameStream(options.stream, count, stream.__getitem__, stamps)
+    return stream, truth
+
+
+def _open(options: argparse.Namespace) -> tuple[Stream, bool]:
+    """Opens the stream; for odometry also one without poses. Returns whether it has them."""
+    from hiosdf_jax._src.datasets.open import open_stream
+    from hiosdf_jax._src.datasets.stream import NoPosesError
 
     names = ("intrinsics", "trajectory", "cloud_topic", "odometry_topic", "world_frame")
     chosen = {name: getattr(options, name, None) for name in names}
     chosen = {name: value for name, value in chosen.items() if value is not None}
-    stream = checked(lambda: open_stream(options.stream, options.format, **chosen))
-    truth = None
-    if isinstance(stream, NpzStream) and options.ground_truth is None:
-        truth = checked(lambda: read_truth(options.stream))
-    if options.frames is not None:
-        count = min(options.frames, len(stream))
-        stream = FrameStream(options.stream, count, stream.__getitem__)
-    return stream, truth
+
+    def opened(poses: bool) -> Stream:
+        return open_stream(options.stream, options.format, poses=poses, **chosen)
+
+    try:
+        return checked(lambda: opened(poses=True)), True
+    except Failure as failure:
+        if not isinstance(failure.__cause__, NoPosesError) or not hasattr(options, "odometry"):
+            raise
+        if not options.odometry:
+            raise Failure(f"{failure}; --odometry maps a stream without poses", BAD_INPUT) from None
+        if options.ground_truth is not None:
+            raise Failure(f"{failure}: --ground-truth needs poses", BAD_INPUT) from None
+    return checked(lambda: opened(poses=False)), False
+
+
+def stamps_of(stream: Stream) -> np.ndarray | None:
+    """The times of the frames, (F,) s, or None where the stream has none."""
+    return getattr(stream, "stamps", None)
 
 
 def complete(bounds: Any, options: argparse.Namespace, stream: Stream) -> tuple[Any, float]:
     """Completes bounds and range of the sensor in a first reading of the stream."""
     from hiosdf_jax._src.datasets.stream import find_bounds
 
+    find = find_bounds_around_start if options.odometry else find_bounds
     extent = checked(
-        lambda: find_bounds(stream, skip_bad_frames=options.skip_bad_frames), code=NOTHING_MAPPED
+        lambda: find(stream, skip_bad_frames=options.skip_bad_frames), code=NOTHING_MAPPED
     )
+    if options.odometry and bounds is None:
+        print(
+            f"no poses say how far the sensor moves: mapping {_AROUND_M} m around what it sees "
+            "from its first position (--bounds sets another box)"
+        )
     bounds = bounds or extent.bounds
     if not math.isfinite(sum(map(sum, bounds)) + extent.max_range):
         raise Failure(
@@ -59,6 +96,50 @@ def complete(bounds: Any, options: argparse.Namespace, stream: Stream) -> tuple[
         f"returns up to {max_range:.1f} m"
     )
     return bounds, max_range
+
+
+def find_bounds_around_start(stream: Stream, *, skip_bad_frames: bool = False) -> Extent:
+    """Finds the range of a sensor, and a box around its first position, without later poses.
+
+    The box holds all clouds as they lie around the sensor, and 3 m more on each side. A sensor that
+    does not see behind itself may turn around, so its box is a cube.
+
+    Args:
+        stream: The frames.
+        skip_bad_frames: Skip bad frames.
+
+    Returns:
+        The bounds, in the world of the first usable frame's pose, and the range of the sensor.
+
+    Raises:
+        BadFrameError: A frame is bad and `skip_bad_frames` is False.
+        ValueError: No frame is usable.
+    """
+    import numpy as np
+
+    from hiosdf_jax._src.datasets.stream import FrameStream, find_bounds
+
+    clouds = FrameStream("stream", len(stream), lambda i: (stream[i][0], np.eye(4)))
+    extent = find_bounds(clouds, _AROUND_M, skip_bad_frames=skip_bad_frames)
+    pose = _first_pose(stream)
+    low, high = np.array(extent.bounds)
+    center, half = (low + high) / 2, (high - low) / 2
+    if (low >= -_AROUND_M).any() or (high <= _AROUND_M).any():  # no returns on one side
+        center, half = pose[:3, 3], np.full(3, np.abs(extent.bounds).max())
+    else:  # along the axes of the world, around the box along those of the sensor
+        center, half = pose[:3, :3] @ center + pose[:3, 3], np.abs(pose[:3, :3]) @ half
+    (x0, y0, z0), (x1, y1, z1) = (center - half).tolist(), (center + half).tolist()
+    return extent._replace(bounds=((x0, y0, z0), (x1, y1, z1)))
+
+
+def _first_pose(stream: Stream) -> np.ndarray:
+    """The pose of the first usable frame, (4, 4) T_world_sensor."""
+    from hiosdf_jax._src.datasets.stream import BadFrameError, read_frame
+
+    for index in range(len(stream)):
+        with contextlib.suppress(BadFrameError):
+            return read_frame(stream, index)[1]
+    raise ValueError(f"none of the {len(stream)} frames can be used, expected at least one")
 
 
 def sample_truth(

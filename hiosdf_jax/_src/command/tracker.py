@@ -25,6 +25,7 @@ from hiosdf_jax._src.view.paths import save_paths
 TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")
 
 _LEAST_DISTANCE_M = 0.05  # shorter distances drift as this one does
+_MOST_AHEAD = 5  # times the last motion; farther ahead its errors grow more than it foretells
 _LOST_FRAMES = 5  # a stream is lost if this many frames at its end do not fit
 
 
@@ -54,13 +55,18 @@ class Tracker:
 
     The first frame has the pose that the stream gives it. Later ones are predicted from the last
     registered frame by the motion between the stream's poses, or, for odometry, from the last two
-    frames by keeping the velocity.
+    frames by keeping the velocity, also over frames that are missing.
 
     Attributes:
         frames: The frames so far, a `Tracked` each.
     """
 
-    def __init__(self, odometry: bool, drift: Sequence[float] | None = None) -> None:
+    def __init__(
+        self,
+        odometry: bool,
+        drift: Sequence[float] | None = None,
+        stamps: np.ndarray | None = None,
+    ) -> None:
         """Begins before the first frame.
 
         Args:
@@ -68,21 +74,36 @@ class Tracker:
             drift: Standard deviations of the motion: share of the distance, and degrees per
                 meter. Then predicted poses are priors. By default they are as exact as `track`
                 assumes.
+            stamps: (F,) s, times of the stream's frames. Where they are not known, or do not
+                increase, the indices of the frames take their place.
         """
         self.frames: list[Tracked] = []
         self._odometry = odometry
         self._drift = drift
+        self._stamps = stamps
         self._reference: Tracked | None = None  # the last frame that fits
 
-    def predict(self, given: np.ndarray) -> np.ndarray:
-        """Predicts the pose of the next frame from the pose (4, 4) that the stream gives it."""
+    def predict(self, given: np.ndarray, frame: int) -> np.ndarray:
+        """Predicts the pose of the next frame.
+
+        Args:
+            given: (4, 4) T_world_sensor, as the stream has it.
+            frame: Its index in the stream.
+
+        Returns:
+            (4, 4) T_world_sensor.
+        """
         if self._reference is None:
             return given
         if not self._odometry:
             reference = self._reference
             return np.asarray(predict_pose(reference.pose, reference.given, given))
-        before, last = self.frames[-2:] if len(self.frames) > 1 else 2 * self.frames
-        return np.asarray(predict_pose(last.pose, before.pose, last.pose))
+        if len(self.frames) < 2:
+            return self.frames[-1].pose
+        before, last = self.frames[-2:]
+        times = self._times(before.frame, last.frame, frame)
+        ahead = min((times[2] - times[1]) / (times[1] - times[0]), _MOST_AHEAD)
+        return continued(before.pose, last.pose, ahead)
 
     def prior_of(self, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns the prior of a predicted pose (4, 4), or None where the drift is not known."""
@@ -97,7 +118,7 @@ class Tracker:
         self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
     ) -> tuple[MapState, np.ndarray]:
         """Registers a frame and fuses it if it fits; returns the map and the pose (4, 4)."""
-        predicted = self.predict(given)
+        predicted = self.predict(given, frame)
         updates = int(state.updates)
         state, found = track(state, cloud, predicted, self.prior_of(predicted))
         return state, self._add(frame, given, found, int(state.updates) > updates)
@@ -106,7 +127,7 @@ class Tracker:
         self, state: MapState, cloud: np.ndarray, given: np.ndarray, frame: int
     ) -> np.ndarray:
         """Registers a frame that the map is not given; returns the pose (4, 4)."""
-        predicted = self.predict(given)
+        predicted = self.predict(given, frame)
         prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
         found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
         moved = max(distance_and_angle(found.pose, jnp.asarray(predicted)))
@@ -135,6 +156,8 @@ class Tracker:
     def write(self, folder: Path, up_world: np.ndarray) -> None:
         """Writes `trajectory.txt`, `trajectory.npz` and `trajectory.png`.
 
+        The times are those of the stream, or else the indices of the frames.
+
         Args:
             folder: Where to write.
             up_world: (3,) unit vector against gravity; the picture looks down along it.
@@ -148,19 +171,39 @@ class Tracker:
         frame = np.array([each.frame for each in self.frames])
         registered = np.array([each.registered for each in self.frames])
         quaternions = without_flips(Rotation.from_matrix(poses[:, :3, :3]).as_quat())
-        rows = np.column_stack([frame, poses[:, :3, 3], quaternions])
+        time = self._times(*frame)
+        rows = np.column_stack([time, poses[:, :3, 3], quaternions])
+        # Readers of this file tell numbers of frames from times by the first word.
+        name, digits = ("frame", "%d") if np.array_equal(time, frame) else ("time", "%.9f")
         with replacing(folder / TRAJECTORY[0]) as file:
-            np.savetxt(file, rows, "%.9g", header="frame tx ty tz qx qy qz qw")
+            np.savetxt(file, rows, [digits] + 7 * ["%.9g"], header=f"{name} tx ty tz qx qy qz qw")
         with replacing(folder / TRAJECTORY[1]) as file:
-            np.savez(file, frame=frame, poses=poses, covariance=covariances, registered=registered)
+            np.savez(
+                file,
+                frame=frame,
+                time=time,
+                poses=poses,
+                covariance=covariances,
+                registered=registered,
+            )
+        moved = (given != given[0]).any()  # poses that are not known are all the identity
         save_paths(
             folder / TRAJECTORY[2],
-            given[:, :3, 3],
+            given[:, :3, 3] if moved else None,
             poses[:, :3, 3],
             registered,
             100 * np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)),
             up_world,
         )
+
+    def _times(self, *frames: int) -> np.ndarray:
+        """Times of frames, (F,) s, or their indices where not all of the times are usable."""
+        indices = np.array(frames, float)
+        if self._stamps is None:
+            return indices
+        times = self._stamps[list(frames)]
+        usable = np.isfinite(times).all() and (np.diff(times) > 0).all()
+        return times if usable else indices
 
     def _add(self, frame: int, given: np.ndarray, found: Registration, fused: bool) -> np.ndarray:
         pose, covariance = np.asarray(found.pose), np.asarray(found.covariance)
@@ -169,6 +212,29 @@ class Tracker:
         if fused:
             self._reference = tracked
         return tracked.pose
+
+
+def continued(before: np.ndarray, last: np.ndarray, ahead: float) -> np.ndarray:
+    """Continues the motion between two poses.
+
+    Args:
+        before: (4, 4) T_world_sensor.
+        last: (4, 4) T_world_sensor, later.
+        ahead: How long to continue, as a multiple of the time between them.
+
+    Returns:
+        (4, 4) float32 T_world_sensor.
+    """
+    from scipy.spatial.transform import Rotation
+
+    back = before[:3, :3].T
+    turn = Rotation.from_matrix(back @ last[:3, :3]).as_rotvec()
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(ahead * turn).as_matrix()
+    # The chord of an arc is turned from the arc's beginning by half the angle of the arc.
+    chord = Rotation.from_rotvec((ahead - 1) / 2 * turn).apply(back @ (last[:3, 3] - before[:3, 3]))
+    motion[:3, 3] = ahead * chord
+    return np.asarray(predict_pose(last, np.eye(4), motion))
 
 
 def without_flips(quaternions: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ numbers as many poses as there are clouds: 0, 1, 2, ... A file that begins with 
 writes it, has numbers of clouds in this order, from 0, and may lack some.
 
 With as many poses as clouds, both readings may give poses, but not the same ones. If the times then
-leave a cloud without a pose, the folder is refused.
+leave a cloud without a pose, the folder is refused. Without poses the file names are the times, if
+they are numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing, read_lines
 from hiosdf_jax._src.datasets.inflating import most_inflated
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, pose_at, read_timed_poses, rows_at
 
 _MAX_GAP = 0.2  # s
@@ -39,13 +40,17 @@ _NANOSECONDS = 1e17  # times from here on are in nanoseconds
 
 
 def cloud_stream(
-    folder: str | os.PathLike[str], trajectory: str | os.PathLike[str] | None = None
+    folder: str | os.PathLike[str],
+    trajectory: str | os.PathLike[str] | None = None,
+    *,
+    poses: bool = True,
 ) -> FrameStream:
     """Opens a folder of PLY or PCD clouds with a trajectory.
 
     Args:
         folder: The folder with `*.ply` or `*.pcd`.
         trajectory: The file of poses; by default the only .txt or .tum file in the folder.
+        poses: Whether to read a trajectory. If not, each pose is the identity.
 
     Returns:
         The clouds as a stream, in the order of their times or names. A cloud that cannot be read
@@ -53,7 +58,8 @@ def cloud_stream(
 
     Raises:
         FileNotFoundError: A file or folder is missing.
-        ValueError: The trajectory is malformed, missing, or does not fit the clouds.
+        NoPosesError: The folder has no .txt or .tum file, and none is given.
+        ValueError: The trajectory is malformed, ambiguous, or does not fit the clouds.
         ModuleNotFoundError: There are .pcd files and pypcd4 is not installed.
 
     Example:
@@ -66,15 +72,21 @@ def cloud_stream(
         raise ValueError(f"{folder}: has no .ply or .pcd file, expected at least one")
     if any(path.suffix.lower() == ".pcd" for path in clouds):
         _require_pypcd4()
+    if not poses:
+        stamps = [_stamp(path) for path in clouds]
+        return FrameStream(folder, len(clouds), lambda i: (_read(clouds[i]), np.eye(4)), stamps)
     trajectory = _only_trajectory(folder) if trajectory is None else trajectory
-    poses = read_timed_poses(trajectory)
-    stamps = np.arange(len(clouds)) if _numbers_frames(trajectory) else _stamps(clouds, poses)
+    timed = read_timed_poses(trajectory)
+    stamps = np.arange(len(clouds)) if _numbers_frames(trajectory) else _stamps(clouds, timed)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
-        path = clouds[index]
-        return _READERS[path.suffix.lower()](path), pose_at(poses, stamps[index], _MAX_GAP)
+        return _read(clouds[index]), pose_at(timed, stamps[index], _MAX_GAP)
 
-    return FrameStream(folder, len(clouds), frame)
+    return FrameStream(folder, len(clouds), frame, stamps)
+
+
+def _read(path: Path) -> np.ndarray:
+    return _READERS[path.suffix.lower()](path)
 
 
 def _sorted(clouds: list[Path]) -> list[Path]:
@@ -98,6 +110,8 @@ def _parts(text: str) -> list[str]:
 
 def _only_trajectory(folder: Path) -> Path:
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".txt", ".tum"))
+    if not found:
+        raise NoPosesError(f"{folder}: has no poses, expected a trajectory in a .txt or .tum file")
     if len(found) != 1:
         names = [path.name for path in found]
         raise ValueError(f"{folder}: trajectory is one of {names}, expected one .txt or .tum file")

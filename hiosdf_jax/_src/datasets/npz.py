@@ -1,6 +1,6 @@
 """Streams in one `.npz` file: a depth camera, a LiDAR's range images, or clouds one after another.
 
-Every file has `poses` (F, 4, 4), T_world_sensor in m, and one of
+Every file has `poses` (F, 4, 4), T_world_sensor in m, unless they are not read, and one of
 
 - `depth` (F, H, W), `K` (3, 3), `depth_scale`: m = depth / depth_scale along the optical axis;
   0 is not a return, as are the values listed in the optional `invalid`;
@@ -9,7 +9,8 @@ Every file has `poses` (F, 4, 4), T_world_sensor in m, and one of
 - `points_mm` (P, 3) mm, sensor frame, `offsets` (F + 1,): frame i has the rows offsets[i] to
   offsets[i + 1].
 
-The optional `eval_*` arrays are exact distances, see `read_truth`.
+The optional `stamp` (F,) has the times of the frames, s. The optional `eval_*` arrays are exact
+distances, see `read_truth`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from hiosdf_jax._src.datasets import sensors
 from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import most_returns
-from hiosdf_jax._src.datasets.stream import frame_index
+from hiosdf_jax._src.datasets.stream import NoPosesError, frame_index
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.numerics.intake import check_pose
 
@@ -47,9 +48,13 @@ class NpzStream:
 
     The raw arrays are held in memory as they are in the file, since compressed npz files cannot be
     memory-mapped. Each item is converted to float32 m.
+
+    Attributes:
+        path: The file.
+        stamps: (F,) float64 s, the times of the frames, or None if the file has none.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, poses: bool = True) -> None:
         """Loads and checks a file.
 
         Only the count and the shape of the poses are checked here: a pose that is not rigid makes
@@ -57,11 +62,13 @@ class NpzStream:
 
         Args:
             path: The `.npz` file.
+            poses: Whether to read the poses. If not, each pose is the identity.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file is no npz file, or a key is missing, misshapen or out of range;
-                the message names the file, the key, what was found and what was expected.
+            NoPosesError: The file has no poses.
+            ValueError: The file is no npz file, or another key is missing, misshapen or out of
+                range; the message names the file, the key, what was found and what was expected.
         """
         self.path = path
         with Archive(path) as archive:
@@ -71,7 +78,9 @@ class NpzStream:
                     f"{path}: has {layouts or 'none'} of the keys {list(_LAYOUTS)}, expected one"
                 )
             self._layout = layouts[0]
-            keys = ("poses", self._layout, *_LAYOUTS[self._layout])
+            if poses and "poses" not in archive.names:
+                raise NoPosesError(f"{path}: has no poses, expected the key 'poses'")
+            keys = (*(["poses"] if poses else []), self._layout, *_LAYOUTS[self._layout])
             missing = [key for key in keys if key not in archive.names]
             if missing:
                 raise ValueError(
@@ -80,14 +89,21 @@ class NpzStream:
                 )
             if self._layout == "depth" and "invalid" in archive.names:
                 keys = (*keys, "invalid")
+            if "stamp" in archive.names:
+                keys = (*keys, "stamp")
             self._arrays = {key: _array(archive, key) for key in keys}
         check = {"depth": self._check_depth, "range": self._check_range}
-        frames = check.get(self._layout, self._check_points)()
-        self._expect("poses", (frames, 4, 4))
+        self._count = check.get(self._layout, self._check_points)()
+        if poses:
+            self._expect("poses", (self._count, 4, 4))
+        self.stamps = None
+        if "stamp" in self._arrays:
+            self._expect("stamp", (self._count,))
+            self.stamps = self._arrays["stamp"].astype(float)
 
     def __len__(self) -> int:
         """The number of frames."""
-        return len(self._arrays["poses"])
+        return self._count
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """One frame.
@@ -104,7 +120,9 @@ class NpzStream:
             ValueError: The pose is not finite or not rigid.
         """
         index = frame_index(index, len(self), self.path)
-        pose = check_pose(self._arrays["poses"][index], f"{self.path}: poses[{index}]")
+        pose = np.eye(4, dtype=np.float32)
+        if "poses" in self._arrays:
+            pose = check_pose(self._arrays["poses"][index], f"{self.path}: poses[{index}]")
         if self._layout == "points_mm":
             offsets = self._arrays["offsets"]
             rows = self._arrays["points_mm"][offsets[index] : offsets[index + 1]]

@@ -49,12 +49,8 @@ _FORMATS = {
     "replicacad": _Format(
         replicacad_stream, "a folder with traj.txt, results", _holds("traj.txt", "results")
     ),
-    "scannet": _Format(
-        scannet_stream, "with depth, pose, intrinsic", _holds("depth", "pose", "intrinsic")
-    ),
-    "tum": _Format(
-        tum_stream, "with depth.txt, groundtruth.txt", _holds("depth.txt", "groundtruth.txt")
-    ),
+    "scannet": _Format(scannet_stream, "with depth, intrinsic", _holds("depth", "intrinsic")),
+    "tum": _Format(tum_stream, "with depth.txt", _holds("depth.txt")),
     "kitti": _Format(kitti_stream, "with velodyne", _holds("velodyne")),
     "clouds": _Format(cloud_stream, "with *.ply or *.pcd", _has_clouds),
     "rosbag": _Format(
@@ -81,7 +77,13 @@ def holds_recording(folder: Path, apart: Collection[str] = ()) -> bool:
     return any(others) or bool(_clouds_in(folder) - set(apart))
 
 
-def open_stream(path: str | os.PathLike[str], format: str | None = None, **options: Any) -> Stream:
+def open_stream(
+    path: str | os.PathLike[str],
+    format: str | None = None,
+    *,
+    poses: bool = True,
+    **options: Any,
+) -> Stream:
     """Opens a recorded stream in any format that has a reader.
 
     Example:
@@ -92,6 +94,8 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
     Args:
         path: The file or folder.
         format: One of `FORMATS`; by default recognized from the file or folder.
+        poses: Whether to read the poses. If not, each pose is the identity, and the recording needs
+            none.
         **options: Options of the format's reader: `intrinsics` for tum, `trajectory` for clouds,
             `cloud_topic`, `odometry_topic` and `world_frame` for rosbag.
 
@@ -100,6 +104,7 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
 
     Raises:
         FileNotFoundError: The path, or a file in it, does not exist.
+        NoPosesError: The recording has no poses.
         ValueError: The format is unknown or ambiguous, has no such option, or a file is malformed.
         ModuleNotFoundError: The format needs a package that is not installed.
     """
@@ -118,10 +123,10 @@ def open_stream(path: str | os.PathLike[str], format: str | None = None, **optio
     if format not in _FORMATS:
         raise ValueError(f"format = {format!r}, expected one of {list(FORMATS)}")
     opener = _FORMATS[format].open
-    known = list(inspect.signature(opener).parameters)[1:]
+    known = [name for name in list(inspect.signature(opener).parameters)[1:] if name != "poses"]
     for name in options:
         if name not in known:
             raise ValueError(
                 f"{name} is not an option of format {format!r}, expected one of {known}"
             )
-    return opener(path, **options)
+    return opener(path, poses=poses, **options)

@@ -17,23 +17,25 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, open_regular, parsing, read_rows
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.numerics.intake import as_number, check_pose
 
 _INFO = ("replicaCAD_info.json", "cam_params.json")
 
 
-def replicacad_stream(folder: str | os.PathLike[str]) -> FrameStream:
+def replicacad_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> FrameStream:
     """Opens a sequence in the layout of iSDF's ReplicaCAD or NICE-SLAM's Replica.
 
     Args:
         folder: The folder with `traj.txt` and `results`.
+        poses: Whether to read `traj.txt`. If not, each pose is the identity.
 
     Returns:
         The depth images as a stream. An image without a usable pose is a bad frame.
 
     Raises:
         FileNotFoundError: A file or folder is missing.
+        NoPosesError: There is no `traj.txt`.
         ValueError: A file is malformed; the message names it and the line.
 
     Example:
@@ -43,11 +45,15 @@ def replicacad_stream(folder: str | os.PathLike[str]) -> FrameStream:
     folder = Path(folder)
     images = numbered_files(folder / "results", r"depth(\d+)\.png")
     path = folder / "traj.txt"
-    rows, lines = read_rows(path, 16)
+    if poses and not path.exists():
+        raise NoPosesError(f"{folder}: has no poses, expected them in {path.name}")
+    rows, lines = read_rows(path, 16) if poses else ((), ())
     matrix, scale, size = _camera(folder)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         number, image = images[index]
+        if not poses:
+            return read_depth(image, scale, matrix, size), np.eye(4)
         if number >= len(rows):
             raise ValueError(f"{path}: {len(rows)} poses, none for {image.name}")
         pose = check_pose(rows[number].reshape(4, 4), f"{path}, line {lines[number]}")

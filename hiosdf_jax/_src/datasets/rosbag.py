@@ -13,7 +13,9 @@ The `rosbags` package reads both kinds of bag without ROS.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import struct
 import weakref
 from collections import defaultdict
 from collections.abc import Iterable
@@ -24,7 +26,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 from hiosdf_jax._src.datasets.inflating import limit_rosbags
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.datasets.timed_poses import TimedPoses, check_unique
 from hiosdf_jax._src.datasets.transforms import Edge, moves, moving, path_up, transform_up
 
@@ -46,6 +48,8 @@ def rosbag_stream(
     cloud_topic: str | None = None,
     odometry_topic: str | None = None,
     world_frame: str | None = None,
+    *,
+    poses: bool = True,
 ) -> FrameStream:
     """Opens a ROS 1 or ROS 2 bag.
 
@@ -55,6 +59,7 @@ def rosbag_stream(
         odometry_topic: Topic of Odometry messages, which replace tf for their child frame. By
             default odometry is used if there is one topic and tf does not contain its motion.
         world_frame: Frame of the map; by default the root of the tf tree.
+        poses: Whether to read tf and odometry. If not, each pose is the identity.
 
     Returns:
         The clouds as a stream. A cloud without transforms at its time, or in a frame that has
@@ -62,9 +67,9 @@ def rosbag_stream(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The bag cannot be read, a topic is missing or ambiguous, the bag does not
-            contain the motion of the sensor, tf and odometry may both be that motion, or a
-            transform has two poses at one time.
+        NoPosesError: The bag does not contain the motion of the sensor.
+        ValueError: The bag cannot be read, a topic is missing or ambiguous, tf and odometry may
+            both be the motion of the sensor, or a transform has two poses at one time.
         ModuleNotFoundError: rosbags is not installed.
 
     Example:
@@ -98,11 +103,13 @@ def rosbag_stream(
         if first is None:
             raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message, expected clouds")
         sensor = _name(first.header.frame_id)
-        edges, above = _tree(path, transforms, odometry, sensor, odometry_topic, world_frame)
+        edges, above = {}, [sensor]  # without poses nothing is above the sensor
+        if poses:
+            edges, above = _tree(path, transforms, odometry, sensor, odometry_topic, world_frame)
         kept_open = closing.pop_all()
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
-        start, among = times[index]
+        start, among, _ = times[index]
         with parsing(f"{path}, {clouds[0].topic} at {start} ns", "PointCloud2"):
             with contextlib.closing(reader.messages(clouds, start=start, stop=start + 1)) as found:
                 connection, _, raw = next(m for i, m in enumerate(found) if i == among)
@@ -124,7 +131,7 @@ def rosbag_stream(
             )
         return _unique_path_up(edges, own, above[-1])
 
-    stream = FrameStream(path, len(times), frame)
+    stream = FrameStream(path, len(times), frame, [stamp for _, _, stamp in times])
     weakref.finalize(stream, kept_open.close)
     return stream
 
@@ -180,22 +187,23 @@ def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection
 
 def _scan(
     reader: AnyReader, clouds: list[Connection]
-) -> tuple[list[tuple[int, int]], list[_Transform], dict[str, list[_Transform]], Any]:
+) -> tuple[list[tuple[int, int, float]], list[_Transform], dict[str, list[_Transform]], Any]:
     """Reads a bag once, one message at a time.
 
     Returns:
-        For each cloud the time of recording, ns, and its rank among the clouds of that time; the
-        transforms of tf; the transforms of each odometry topic; the first cloud's message.
+        For each cloud the time of recording, ns, its rank among the clouds of that time, and its
+        stamp, s; the transforms of tf; the transforms of each odometry topic; the first cloud's
+        message.
     """
     wanted = [c for c in reader.connections if c.msgtype in (*_TRANSFORMS, _ODOMETRY)]
-    times: list[tuple[int, int]] = []
+    times: list[tuple[int, int, float]] = []
     transforms: list[_Transform] = []
     odometry: dict[str, list[_Transform]] = defaultdict(list)
     first = None
     for connection, time, raw in reader.messages([*clouds, *wanted]):
         if connection.msgtype == _CLOUD:
             again = bool(times) and times[-1][0] == time
-            times.append((time, times[-1][1] + 1 if again else 0))
+            times.append((time, times[-1][1] + 1 if again else 0, _stamp_of(raw, reader.is2)))
             if first is None:
                 first = reader.deserialize(raw, connection.msgtype)
             continue
@@ -263,7 +271,7 @@ def _tree(
     if world_frame is not None:
         _check_world_frame(path, edges, to_root, world_frame)
     elif odometry_topic is None and not moving(edges, to_root):  # odometry may well stand still
-        raise ValueError(
+        raise NoPosesError(
             f"{path}: nothing moves above the cloud's frame, {' in '.join(to_root)}; expected tf, "
             f"or one of the odometry topics {sorted(odometry)} whose child is one of these frames, "
             "or a world_frame if the sensor stands still"
@@ -284,7 +292,7 @@ def _odometry_edges(
     moved = _edges(path, odometry[topic])
     above = path_up(edges | moved, sensor)
     if moved.keys().isdisjoint(above):
-        raise ValueError(
+        raise NoPosesError(
             f"{path}: odometry topic {topic} moves {list(moved)}, expected one of {above}, the "
             "frames from the cloud's frame upward"
         )
@@ -363,6 +371,19 @@ def _tf_has(edges: dict[str, Edge], sensor: str, child: str, parent: str) -> boo
 
 def _name(frame: str) -> str:
     return frame.lstrip("/")  # old tf wrote names with a leading slash
+
+
+def _stamp_of(raw: bytes, is_ros2: bool) -> float:
+    """Time of a message that begins with a header, s, without the cost of reading the rest of it.
+
+    Four bytes are before the stamp: a count in ROS 1, and in ROS 2 the encoding, whose second byte
+    is the order of the bytes.
+    """
+    if len(raw) < 12:
+        return math.nan
+    order = ">" if is_ros2 and raw[1] == 0 else "<"
+    seconds, nanoseconds = struct.unpack_from(f"{order}II", raw, 4)
+    return seconds + 1e-9 * nanoseconds
 
 
 def _seconds(stamp: Any) -> float:

@@ -17,17 +17,18 @@ import numpy as np
 from hiosdf_jax._src.datasets.depth import read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
 from hiosdf_jax._src.datasets.sensors import check_camera
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.numerics.intake import check_pose
 
 _SCALE = 1000.0  # depth is in mm
 
 
-def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
+def scannet_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> FrameStream:
     """Opens the exported frames of a ScanNet scene.
 
     Args:
         folder: The folder with `depth`, `pose` and `intrinsic`.
+        poses: Whether to read `pose`. If not, each pose is the identity.
 
     Returns:
         The depth images as a stream. An image without a pose, or with ScanNet's -inf, is a bad
@@ -35,6 +36,7 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
 
     Raises:
         FileNotFoundError: A file or folder is missing.
+        NoPosesError: There is no folder `pose`.
         ValueError: A file is malformed, and the message names it and the line; or a frame has two
             images.
 
@@ -45,13 +47,17 @@ def scannet_stream(folder: str | os.PathLike[str]) -> FrameStream:
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")
     _check_once(images)
+    if poses and not (folder / "pose").exists():
+        raise NoPosesError(f"{folder}: has no poses, expected them in the folder pose")
     path = folder / "intrinsic" / "intrinsic_depth.txt"
     matrix = _matrix(path)[:3, :3]
     check_camera(f"{path}: camera matrix", matrix)
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
-        source = _pose_file(folder / "pose", *images[index])
-        pose = check_pose(_matrix(source), str(source))
+        pose = np.eye(4)
+        if poses:
+            source = _pose_file(folder / "pose", *images[index])
+            pose = check_pose(_matrix(source), str(source))
         return read_depth(images[index][1], _SCALE, matrix), pose
 
     return FrameStream(folder, len(images), frame)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from hiosdf_jax._src.numerics.intake import as_number, check_pose, cloud_and_returns
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
@@ -36,6 +37,9 @@ class Stream(Protocol):
 
             def __getitem__(self, index):
                 return np.load(self.files[index]), self.poses[index]
+
+    A stream may also have an attribute `stamps`: (F,) s, the times of its frames. A trajectory that
+    `hiosdf map` writes has these times.
     """
 
     def __len__(self) -> int:
@@ -64,8 +68,16 @@ class BadFrameError(ValueError):
     """A frame of a stream cannot be used; the message names the frame and the reason."""
 
 
+class NoPosesError(ValueError):
+    """A recording has no poses. With `poses=False`, `open_stream` opens it nevertheless."""
+
+
 class FrameStream:
     """A `Stream` that reads each frame on demand.
+
+    Attributes:
+        path: Where the frames are.
+        stamps: (F,) float64 s, the times of the frames, or None if they are not known.
 
     Example:
         first_frames = FrameStream("drive", 20, stream.__getitem__)
@@ -76,6 +88,7 @@ class FrameStream:
         path: str | os.PathLike[str],
         count: int,
         read: Callable[[int], tuple[np.ndarray, np.ndarray]],
+        stamps: npt.ArrayLike | None = None,
     ) -> None:
         """Makes a stream from a function.
 
@@ -84,8 +97,17 @@ class FrameStream:
             count: Number of frames.
             read: Maps 0 <= index < count to a cloud (N, 3) and a pose (4, 4), as in `Stream` but
                 of any float type.
+            stamps: (count,) s, the times of the frames, NaN where they are not known.
+
+        Raises:
+            ValueError: There are more stamps than frames, or fewer.
         """
         self.path = path
+        self.stamps = None if stamps is None else np.asarray(stamps, float)
+        if self.stamps is not None and self.stamps.shape != (count,):
+            raise ValueError(
+                f"{path}: stamps has shape {self.stamps.shape}, expected ({count},), one a frame"
+            )
         self._count, self._read = count, read
 
     def __len__(self) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import read_words
-from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
 
 _SCALE = 5000.0
@@ -34,7 +34,10 @@ _FREIBURG = {
 
 
 def tum_stream(
-    folder: str | os.PathLike[str], intrinsics: Sequence[float] | None = None
+    folder: str | os.PathLike[str],
+    intrinsics: Sequence[float] | None = None,
+    *,
+    poses: bool = True,
 ) -> FrameStream:
     """Opens a sequence in the layout of the TUM RGB-D benchmark.
 
@@ -42,12 +45,14 @@ def tum_stream(
         folder: The folder with `depth.txt` and `groundtruth.txt`.
         intrinsics: fx, fy, cx, cy in pixels; by default those of the benchmark's camera that the
             folder is named after (freiburg1, 2 or 3).
+        poses: Whether to read `groundtruth.txt`. If not, each pose is the identity.
 
     Returns:
         The depth images as a stream. An image without a pose at its time is a bad frame.
 
     Raises:
         FileNotFoundError: A file is missing.
+        NoPosesError: There is no `groundtruth.txt`.
         ValueError: A file is malformed, and the message names it and the line; or the camera is
             unknown.
 
@@ -64,7 +69,10 @@ def tum_stream(
             raise ValueError(f"{folder / 'depth.txt'}, line {line}: {error}") from error
     if not images:
         raise ValueError(f"{folder / 'depth.txt'}: has no image, expected at least one")
-    poses = read_timed_poses(folder / "groundtruth.txt")
+    path = folder / "groundtruth.txt"
+    if poses and not path.exists():
+        raise NoPosesError(f"{folder}: has no poses, expected them in {path.name}")
+    trajectory = read_timed_poses(path) if poses else None
     size = None
     if intrinsics is None:
         found = re.search(r"(?:freiburg|fr)([123])(?!\d)", folder.absolute().name)
@@ -78,7 +86,7 @@ def tum_stream(
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
         stamp, image = images[index]
-        pose = pose_at(poses, stamp, _MAX_GAP)
+        pose = np.eye(4) if trajectory is None else pose_at(trajectory, stamp, _MAX_GAP)
         return read_depth(image, _SCALE, matrix, size), pose
 
-    return FrameStream(folder, len(images), frame)
+    return FrameStream(folder, len(images), frame, [stamp for stamp, _ in images])

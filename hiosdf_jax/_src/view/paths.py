@@ -14,17 +14,17 @@ _MOST_SPREAD_CM = 1000.0  # larger ones are of directions of which nothing is kn
 
 def save_paths(
     path: str | os.PathLike[str],
-    given_world: np.ndarray,
+    given_world: np.ndarray | None,
     refined_world: np.ndarray,
     registered: np.ndarray,
     spread_cm: np.ndarray,
     up_world: np.ndarray,
 ) -> None:
-    """Draws a path as it was given and as it was refined.
+    """Draws a path as it was given, if it was, and as it was refined.
 
     Args:
         path: The picture; its suffix names the format.
-        given_world: (F, 3) m, the sensor's positions before.
+        given_world: (F, 3) m, the sensor's positions before, or None.
         refined_world: (F, 3) m, and after.
         registered: (F,) bool; the others are marked.
         spread_cm: (F,) cm, standard deviation of the refined positions in the map.
@@ -37,13 +37,16 @@ def save_paths(
 
     rotation = world_from_level(up_world)
     frame_name = "leveled" if is_tilted(up_world) else "world"
-    given, refined = ((places @ rotation)[:, :2] for places in (given_world, refined_world))
-    way_cm = 100 * np.linalg.norm(refined_world - given_world, axis=-1)
+    refined = (refined_world @ rotation)[:, :2]
     frame = np.arange(len(refined))
 
     figure = Figure(figsize=(12, 5.5), layout="constrained")
     above, over_time = figure.subplots(1, 2)
-    above.plot(*given.T, color="0.6", linewidth=3, label="as given")
+    if given_world is not None:
+        given = (given_world @ rotation)[:, :2]
+        above.plot(*given.T, color="0.6", linewidth=3, label="as given")
+        way_cm = 100 * np.linalg.norm(refined_world - given_world, axis=-1)
+        over_time.plot(frame, way_cm, color="0.4", label="from the given to the refined position")
     above.plot(*refined.T, color="tab:blue", label="refined by the map")
     above.plot(*refined[0], "o", color="tab:green", label="start")
     if not registered.all():
@@ -52,7 +55,6 @@ def save_paths(
     above.set_aspect("equal")
     above.set_adjustable("datalim")
     above.legend()
-    over_time.plot(frame, way_cm, color="0.4", label="from the given to the refined position")
     known = registered & (spread_cm < _MOST_SPREAD_CM)
     over_time.plot(
         frame,
