@@ -131,7 +131,7 @@ class Tracker:
         prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
         found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
         moved = max(distance_and_angle(found.pose, jnp.asarray(predicted)))
-        near = bool(found.converged) and moved <= MOST_MOVED * GROWING_REACH_M
+        near = bool(found.converged) and float(moved) <= MOST_MOVED * GROWING_REACH_M
         if not near:
             found = found._replace(pose=predicted, converged=jnp.asarray(False))
         return self._add(frame, given, found, near)
