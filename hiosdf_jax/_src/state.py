@@ -14,6 +14,7 @@ import optax
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.arrays import scalar
+from hiosdf_jax._src.numerics.describing import Described
 from hiosdf_jax._src.numerics.exporting import export_optimizer, exportable
 from hiosdf_jax._src.numerics.intake import is_traced
 
@@ -82,7 +83,7 @@ class Flag(enum.IntFlag):
 
 
 @exportable()
-class Report(flax.struct.PyTreeNode):
+class Report(Described):
     """Summary of the last update; `flags` collects those of all updates.
 
     Updates that changed nothing else leave all numbers as they were, but for the flags and
@@ -116,7 +117,7 @@ class Report(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Evidence(flax.struct.PyTreeNode):
+class Evidence(Described):
     """What each voxel remembers of the rays that met it.
 
     Offsets are from the voxel's center, in voxels.
@@ -163,7 +164,7 @@ class Side(enum.IntEnum):
 
 
 @exportable()
-class Derived(flax.struct.PyTreeNode):
+class Derived(Described):
     """Distances of each voxel, derived from the evidence around it.
 
     Attributes:
@@ -187,7 +188,7 @@ class Derived(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Grid(flax.struct.PyTreeNode):
+class Grid(Described):
     """The coarse global grid.
 
     Attributes:
@@ -200,7 +201,7 @@ class Grid(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Surface(flax.struct.PyTreeNode):
+class Surface(Described):
     """What queries read of the grid.
 
     Attributes:
@@ -215,7 +216,7 @@ class Surface(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Network(flax.struct.PyTreeNode):
+class Network(Described):
     """The SIREN and its optimizer.
 
     Attributes:
@@ -231,7 +232,7 @@ class Network(flax.struct.PyTreeNode):
     origin_world: jax.Array
 
 
-class _FloatLeaves(flax.struct.PyTreeNode):
+class _FloatLeaves(Described):
     """A pytree whose float leaves can be taken apart from the others, for `jax.grad`."""
 
     def differentiable(self) -> Self:
