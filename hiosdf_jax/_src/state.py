@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, Literal, NamedTuple, Self
+import operator
+from typing import Any, Literal, NamedTuple, Self, SupportsIndex, cast
 
 import flax.serialization
 import flax.struct
@@ -40,8 +41,10 @@ def frontier_step_m(config: Config) -> float:
 class Flag(enum.IntFlag):
     """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`.
 
+    `Flag` takes these arrays as they are; of a stack of maps it takes one after the other.
+
     Example:
-        >>> flags = hio.Flag(int(state.report.update_flags))
+        >>> flags = hio.Flag(state.report.update_flags)
         >>> hio.Flag.BAD_POSE in flags
         False
         >>> print(flags)
@@ -70,6 +73,16 @@ class Flag(enum.IntFlag):
     """`track` found no pose at which the cloud fits the map. It was not fused."""
     FUSED_AS_PREDICTED = 256
     """`track` fused the cloud at its predicted pose: the map was too young to register it."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Flag:
+        """Takes the bits of a report, which are an array."""
+        if isinstance(value, int):
+            return cast(Flag, super()._missing_(value))
+        try:
+            return cls(operator.index(cast(SupportsIndex, value)))
+        except TypeError as error:
+            raise ValueError(f"flags is {value!r}, expected an integer, as in a report") from error
 
     def __str__(self) -> str:
         """Returns the names of the flags with `|` between them, or "none"."""
