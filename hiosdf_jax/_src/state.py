@@ -388,17 +388,32 @@ def _from_flax(state: MapState, data: dict[str, Any]) -> MapState:
 flax.serialization.register_serialization_state(MapState, _to_flax, _from_flax, override=True)
 
 
-def check_map(state: Any, stacked: bool = False, name: str = "state") -> None:
-    """Raises a ValueError if an argument is not a map, or not a single one."""
+_ONE_OF_THEM = "for one of them use jax.tree.map(lambda x: x[i], maps)"
+
+
+def check_map(
+    state: Any, stacked: bool = False, name: str = "state", batched: str | None = None
+) -> None:
+    """Checks that an argument is a map.
+
+    Args:
+        state: The argument.
+        stacked: Whether it may be a stack of maps.
+        name: Name of the argument in error messages.
+        batched: The call that does the same for a stack, for error messages.
+
+    Raises:
+        ValueError: It is no map, or a stack, or was donated.
+    """
     if not isinstance(state, MapState):
         raise ValueError(f"{name} is {type(state).__name__}, expected a MapState from hio.init")
     if stacked:
         _check_kept(name, state)
     else:
-        check_single(name, state)
+        check_single(name, state, batched)
 
 
-def check_single(name: str, field: MapState | Field | Baked) -> None:
+def check_single(name: str, field: MapState | Field | Baked, batched: str | None = None) -> None:
     """Raises a ValueError if an argument is a stack of maps, or arrays that do not match."""
     _check_kept(name, field)
     if isinstance(field, Baked):
@@ -409,13 +424,10 @@ def check_single(name: str, field: MapState | Field | Baked) -> None:
                 "expected equal ones"
             )
     voxels = _voxels(field)
-    axes = np.ndim(voxels) - 3
-    if axes:
-        raise ValueError(
-            f"{name} has voxels of shape {np.shape(voxels)}, expected those of one map: for "
-            f"{np.shape(voxels)[0]} maps at once use jax.vmap, for example "
-            f"jax.vmap(hio.sdf, in_axes=(0, None))(fields, points)"
-        )
+    shape = np.shape(voxels)
+    if len(shape) != 3:
+        advice = f"for {shape[0]} maps at once use {batched}" if batched else _ONE_OF_THEM
+        raise ValueError(f"{name} has voxels of shape {shape}, expected those of one map: {advice}")
 
 
 def _check_kept(name: str, field: MapState | Field | Baked) -> None:
@@ -449,11 +461,12 @@ def field_of(state: MapState) -> Field:
     )
 
 
-def as_live_field(field: MapState | Field) -> Field:
+def as_live_field(field: MapState | Field, batched: str | None = None) -> Field:
     """Selects what queries read of a map or of a snapshot, without a copy.
 
     Args:
         field: A map or a snapshot of one.
+        batched: As for `check_map`.
 
     Returns:
         The field.
@@ -464,5 +477,5 @@ def as_live_field(field: MapState | Field) -> Field:
     """
     if not isinstance(field, MapState | Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
-    check_single("field", field)
+    check_single("field", field, batched)
     return field_of(field) if isinstance(field, MapState) else field

@@ -92,7 +92,7 @@ def update(
         >>> for cloud, pose in stream:
         ...     state = hio.update(state, cloud, pose)
     """
-    check_map(state)
+    check_map(state, batched="jax.vmap(hio.update)(maps, clouds, poses)")
     extras = check_extras(robot, noise)
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
         return run_update(state, *as_traced(cloud, pose), extras)
