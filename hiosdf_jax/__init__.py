@@ -1,4 +1,18 @@
-"""Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463)."""
+"""Online signed distance fields for robots that plan in JAX (HIO-SDF, arXiv 2310.09463).
+
+The main calls:
+
+    config = hio.Config.light(bounds)            # settings for a CPU; hio.Config(bounds) for a GPU
+    state = hio.init(config, jax.random.key(0))  # an empty map
+    state = hio.update(state, cloud, pose)       # the map with one more point cloud
+    field = hio.snapshot(state)                  # what a planner keeps
+    distances = hio.sdf(field, points)           # m, at points of any shape (..., 3)
+    distances, gradients = hio.sdf_and_grad(field, points)
+    hio.Flag(state.report.update_flags)          # what was wrong with the last cloud
+
+`planning` has clearances for controllers, `datasets` the readers of recordings, and `demo` a
+simulated apartment. `help(hio.update)` has the rest of a call.
+"""
 
 from __future__ import annotations
 
@@ -83,5 +97,6 @@ def __getattr__(name: str) -> ModuleType:
 
 
 def __dir__() -> list[str]:
-    """Lists them, too."""
-    return sorted({*globals(), *_MODULES})
+    """Lists the public names alone: those modules too, and nothing that this file imports."""
+    special = (name for name in globals() if name.startswith("__"))
+    return sorted({*__all__, *_MODULES, *special})

@@ -103,6 +103,7 @@ def __getattr__(name: str) -> ModuleType:
 
 
 def __dir__() -> list[str]:
-    """Lists the adapters too whose library is installed."""
+    """Lists the public names alone, and the adapters whose library is installed."""
     adapters = (name for name, library in _ADAPTERS.items() if importlib.util.find_spec(library))
-    return sorted({*globals(), *adapters})
+    special = (name for name in globals() if name.startswith("__"))
+    return sorted({*__all__, *adapters, *special})

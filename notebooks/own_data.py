@@ -111,7 +111,7 @@ for index in range(len(frames)):
     else:
         state = hio.update(state, cloud, pose)
 field = hio.snapshot(state)
-print(int(state.updates), "updates; flags:", repr(hio.Flag(int(state.report.flags))))
+print(int(state.updates), "updates; flags:", repr(hio.Flag(state.report.flags)))
 
 # %% [markdown]
 # Flags name what was wrong in any update: `BAD_POSE` is a matrix that is not rigid, and

@@ -49,7 +49,7 @@ for cloud, pose in stream:
     state = hio.update(state, cloud, pose)
 print("points used by the last update:", int(state.report.points_used))
 print(f"mean |f - s| of its training samples: {100 * float(state.report.sdf_loss):.1f} cm")
-print("flags so far:", repr(hio.Flag(int(state.report.flags))))
+print("flags so far:", repr(hio.Flag(state.report.flags)))
 
 # %% [markdown]
 # No flag: no cloud was refused, and no return in range lay outside the bounds.

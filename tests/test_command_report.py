@@ -25,7 +25,7 @@ def mapped():
         state=state.replace(report=state.report.replace(flags=flags)),
         path_world=np.zeros((4, 3)),
         up_world=np.array([0.0, 0, 1]),
-        update_seconds=np.array([5.0, 0.1, 0.3, 0.2]),
+        update_seconds=np.array([5.0, 0.9, 0.1, 0.3, 0.2]),
         last_frame=5,
         skipped=2,
         stopped=BadFrameError("frame 6: no pose"),
@@ -34,19 +34,29 @@ def mapped():
     )
 
 
-def test_times_exclude_the_update_that_compiles(mapped):
+def test_times_exclude_the_updates_that_compile_and_warm_up(mapped):
     metrics = report.describe(mapped, CONFIG)
     assert metrics["compile_s"] == 5
+    assert metrics["warmup_median_ms"] == pytest.approx(900)
     assert metrics["update_median_ms"] == pytest.approx(200)
     assert metrics["update_p90_ms"] == pytest.approx(280)
     assert metrics["flags"] == ["POINTS_OUTSIDE", "TRAINING_FAILED"]
     assert hio.Config(**metrics["config"]) == CONFIG
 
 
+def test_a_run_that_continues_a_map_does_not_warm_up_again(mapped):
+    later = mapped.state.replace(updates=np.int32(20))
+    metrics = report.describe(dataclasses.replace(mapped, state=later), CONFIG)
+    assert math.isnan(metrics["warmup_median_ms"])
+    assert metrics["update_median_ms"] == pytest.approx(250)
+    assert "first 5.0 s (it compiles), then 250 ms (median), " in report.summarize(metrics)
+
+
 def test_the_summary_names_what_went_wrong(mapped):
     metrics = report.describe(mapped, CONFIG)
     text = report.summarize(metrics)
-    assert "first 5.0 s (it compiles), then 200 ms (median), 280 ms (90 % below)" in text
+    expected = "first 5.0 s (it compiles), 900 ms while warming up, then 200 ms (median), 280 ms ("
+    assert expected in text
     assert "2 frames could not be used and were skipped" in text
     assert "ended early by frame 6: no pose" in text
     assert "points in range fell outside the bounds and left no surface (4 of 2404)" in text

@@ -217,6 +217,21 @@ def test_exports_that_cannot_be_are_one_line(arguments, message, saved, monkeypa
     assert saved.read_bytes() == before and list(saved.parent.iterdir()) == [saved]
 
 
+def test_a_run_of_some_frames_says_why_the_surface_has_no_score(tmp_path, no_pictures, capsys):
+    stream, out = write_range(tmp_path / "room.npz", 6), tmp_path / "out"
+    kept, scores = tmp_path / "map.npz", tmp_path / "scores.json"
+    arguments = ["map", str(stream), *BOX, "--output", str(out), "--save", str(kept)]
+    for frames, is_scored in (("6", True), ("3", False)):
+        assert cli.main([*arguments, "--frames", frames]) == 0
+        assert cli.main(["eval", str(kept), str(stream), "--to", str(scores)]) == 0
+        for path in (out / "metrics.json", scores):
+            written = json.loads(path.read_text())
+            assert (written["scores"]["surface_cm"] is not None) == is_scored
+            assert ("surface_cm" in written.get("not_scored", {})) == (not is_scored)
+        line = "|sdf| on the surface: it is scored once all frames are mapped: "
+        assert capsys.readouterr().out.count(line) == (0 if is_scored else 2)
+
+
 def test_a_saved_map_is_scored_as_its_run_was(tmp_path, no_pictures, capsys):
     stream, out = write_range(tmp_path / "room.npz", 6), tmp_path / "out"
     kept, scores = tmp_path / "map.npz", tmp_path / "scores.json"

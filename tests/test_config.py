@@ -1,10 +1,12 @@
 """Every field of the configuration is checked, and the voxel grid follows from the bounds."""
 
+import ast
 import copy
 import dataclasses
 import inspect
 import math
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -22,6 +24,17 @@ LIMITS = [
 def test_the_bare_constructor_is_the_default():
     assert hio.Config(BOUNDS) == hio.Config.default(BOUNDS)
     assert hio.Config(BOUNDS) != hio.Config.paper(BOUNDS)
+
+
+@pytest.mark.parametrize("name", ["light", "paper"])
+def test_a_preset_s_help_lists_what_it_changes(name):
+    preset = getattr(hio.Config, name)
+    text = inspect.getdoc(preset).split("Args:")[0]
+    listed = {
+        field: ast.literal_eval(value) for field, value in re.findall(r"(\w+)=([\w.-]+)", text)
+    }
+    own, default = (dataclasses.asdict(each(BOUNDS)) for each in (preset, hio.Config))
+    assert listed == {field: value for field, value in own.items() if value != default[field]}
 
 
 def test_the_paper_s_numbers():

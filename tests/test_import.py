@@ -1,8 +1,12 @@
 """A robot imports the core alone: no simulator, mesh library or plotting."""
 
+import operator
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import hiosdf_jax as hio
 
@@ -45,6 +49,22 @@ assert hio.planning.trajectory and hio.__version__
 assert {"demo", "datasets", "scoring", "pictures"} <= set(dir(hio))
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("module", [hio, hio.planning], ids=["hiosdf_jax", "planning"])
+def test_dir_lists_public_names_alone(module):
+    listed = {name for name in dir(module) if not name.startswith("__")}
+    others = {*hio._MODULES, *hio.planning._ADAPTERS}
+    assert listed >= set(module.__all__)
+    assert listed - set(module.__all__) <= others
+    assert "__doc__" in dir(module)
+
+
+def test_the_help_of_the_package_names_calls_that_exist():
+    calls = re.findall(r"hio\.([\w.]+)\(", hio.__doc__)
+    assert {"init", "update", "snapshot", "sdf", "Config.light"} <= set(calls)
+    for call in calls:
+        assert callable(operator.attrgetter(call)(hio)), call
 
 
 def test_the_package_says_that_it_has_types():

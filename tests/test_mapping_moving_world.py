@@ -221,8 +221,8 @@ def test_flags_of_the_last_update_and_of_all(sharp_map):
         ((cloud, pose), none, beyond | false),
     ):
         state = hio.update(state, *frame)
-        assert hio.Flag(int(state.report.update_flags)) == last
-        assert hio.Flag(int(state.report.flags)) == every
+        assert hio.Flag(state.report.update_flags) == last
+        assert hio.Flag(state.report.flags) == every
 
 
 @pytest.mark.parametrize("name", ["empty_map", "sharp_map"])

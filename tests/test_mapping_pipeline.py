@@ -135,7 +135,7 @@ def test_points_outside_the_bounds_leave_no_surface_but_clear_their_ray(empty_ma
     state = hio.update(empty_map, cloud, np.eye(4))
     assert int(state.report.points_outside) == 1
     assert int(state.report.points_used) == 1
-    assert hio.Flag(int(state.report.flags)) == hio.Flag.POINTS_OUTSIDE
+    assert hio.Flag(state.report.flags) == hio.Flag.POINTS_OUTSIDE
     assert float(jnp.sum(state.grid.evidence.hits)) == 1
     assert float(state.grid.evidence.passes[-1, 10, 8]) > 0
     # A sensor that is far outside of the box with all its points must not harm the map either.
@@ -280,6 +280,18 @@ def test_flags_print_their_names(flags, names):
     assert str(flags) == f"{flags}" == names
     assert f"{flags:>40}" == names.rjust(40)
     assert (hio.Flag.OUT_OF_RANGE in flags) == ("OUT_OF_RANGE" in names)
+
+
+@pytest.mark.parametrize("kind", [jnp.uint32, np.uint32, np.array])
+@pytest.mark.parametrize("bits", [0, 2, 48, 1 + 2**20])
+def test_flags_are_made_of_the_array_in_a_report(kind, bits):
+    assert hio.Flag(kind(bits)) is hio.Flag(bits)
+
+
+@pytest.mark.parametrize("value", [2.5, np.float32(3), "2", None])
+def test_flags_of_no_integer_are_refused(value):
+    with pytest.raises(ValueError, match=r"flags is .*, expected an integer, as in a report"):
+        hio.Flag(value)
 
 
 OUT_OF_RANGE = {"far": np.full((50, 3), 30.0), "near": np.zeros((4, 3))}

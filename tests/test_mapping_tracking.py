@@ -55,7 +55,7 @@ def test_a_frame_of_another_place_changes_nothing_but_the_flags(sharp_map):
     assert not bool(found.converged)
     np.testing.assert_array_equal(found.pose, pose)
     assert np.diag(found.covariance).min() >= 100**2
-    assert hio.Flag(int(state.report.update_flags)) == hio.Flag.NOT_REGISTERED
+    assert hio.Flag(state.report.update_flags) == hio.Flag.NOT_REGISTERED
     same = state.replace(report=sharp_map.report)
     assert arrays_equal(same, sharp_map)
 

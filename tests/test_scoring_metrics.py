@@ -9,6 +9,7 @@ import pytest
 from exact_sphere import CENTER, RADIUS, sphere, sphere_truth
 
 from hiosdf_jax._src.scoring import metrics
+from hiosdf_jax._src.scoring.metrics import explain_missing
 from hiosdf_jax.datasets import read_truth
 from hiosdf_jax.scoring import (
     GroundTruth,
@@ -129,6 +130,8 @@ def test_the_surface_has_no_score_if_frames_are_left_out():
     truth = sphere_truth()
     assert math.isnan(evaluate(sphere, truth, last_frame=3)["surface_cm"])
     assert math.isfinite(evaluate(sphere, truth, last_frame=9)["surface_cm"])
+    assert set(explain_missing(truth, 3)) == {"surface_cm"}
+    assert explain_missing(truth, 9) == explain_missing(truth, None) == {}
 
 
 def test_thin_parts_are_kept_within_2_cm():

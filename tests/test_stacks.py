@@ -28,6 +28,8 @@ What has failed in users' stacks, and the test of it. Those without a file are i
 - a stacked map without vmap
     test_a_stack_of_maps_is_refused_with_a_word_on_vmap
     test_a_stack_of_maps_is_refused_by_what_takes_one_map
+    test_a_stack_of_maps_is_refused_by_what_takes_one_field
+    test_the_calls_that_the_messages_name_work
 - clouds of many sizes in jit(update)
     test_mapping_input.test_a_padded_cloud_is_what_update_maps
     test_mapping_input.test_pad_cloud_refuses_what_update_refuses
@@ -62,6 +64,7 @@ What has failed in users' stacks, and the test of it. Those without a file are i
 """
 
 import functools
+import re
 
 import jax
 import jax.flatten_util
@@ -80,6 +83,7 @@ POINTS = np.random.default_rng(0).uniform(-0.8, 0.8, (COUNT, 3)).astype(np.float
 RADII = np.full(COUNT, 0.05, np.float32)
 ROWS = PartitionSpec("rows")
 KINDS = ["map", "baked"]
+ONE_OF_THEM = re.escape("for one of them use jax.tree.map(lambda x: x[i], maps)")
 
 
 @pytest.fixture(scope="module")
@@ -310,16 +314,57 @@ def test_a_stack_of_maps_is_refused_with_a_word_on_vmap(fields, kind):
 
 def test_a_stack_of_maps_is_refused_by_what_takes_one_map(empty_map, tmp_path):
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), empty_map)
-    with pytest.raises(ValueError, match=r"state .* jax\.vmap"):
-        hio.update(stack, *stream(1)[0])
+    for function in (hio.update, hio.track, hio.moving_rows):
+        call = re.escape(f"2 maps at once use jax.vmap(hio.{function.__name__})(maps, clouds, ")
+        with pytest.raises(ValueError, match=f"state .* {call}"):
+            function(stack, *stream(1)[0])
+    for call in (
+        lambda: hio.save(tmp_path / "maps.npz", stack),
+        lambda: hio.grow(stack, empty_map.config.bounds),
+        lambda: hio.forget(stack, empty_map.config.bounds),
+    ):
+        with pytest.raises(ValueError, match=rf"state .* {ONE_OF_THEM}"):
+            call()
+    with pytest.raises(ValueError, match=r"state .* jax\.vmap\(hio\.transform\)\(maps, poses\)"):
+        hio.transform(stack, np.eye(4))
+    with pytest.raises(ValueError, match=r"^b .* jax\.vmap\(hio\.merge\)\(maps_a, maps_b, poses"):
+        hio.merge(empty_map, stack, np.eye(4))
+
+
+def test_a_stack_of_maps_is_refused_by_what_takes_one_field(empty_map, tmp_path):
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), empty_map)
     exported = functools.partial(exports.export_map, tmp_path / "map.npz")
     costmap = functools.partial(exports.costmap, floor_m=-0.8, height_m=1.0, radius_m=0.2)
     for function in (hio.bake, hio.extract_mesh, hio.view, exported, costmap, exports.voxel_grid):
+        call = r"jax\.vmap\(lambda field: hio\.bake" if function == hio.bake else ONE_OF_THEM
         for field in (stack, hio.snapshot(stack)):
-            with pytest.raises(ValueError, match=r"field .* jax\.vmap"):
+            with pytest.raises(ValueError, match=f"field .* {call}"):
                 function(field)
         with pytest.raises(ValueError, match="field is dict, expected a MapState or a Field"):
             function({})
+
+
+def test_the_calls_that_the_messages_name_work(empty_map):
+    maps = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), empty_map)
+    fields = hio.snapshot(maps)
+    assert arrays_equal(jax.tree.map(lambda x: x[1], maps), empty_map)
+    clouds, poses = map(jnp.stack, zip(*stream(2), strict=True))
+    for function in (hio.update, hio.track, hio.moving_rows):
+        jax.eval_shape(jax.vmap(function), maps, clouds, poses)
+    jax.eval_shape(jax.vmap(hio.transform), maps, poses)
+    jax.eval_shape(jax.vmap(hio.merge), maps, maps, poses)
+    jax.eval_shape(jax.vmap(lambda field: hio.bake(field, 0.2)), fields)
+    keys = jax.random.split(jax.random.key(0), 2)
+    with pytest.raises(ValueError, match=r"key .* 2 of them use jax\.vmap\(functools\.partial"):
+        hio.init(empty_map.config, keys)
+    made = jax.eval_shape(jax.vmap(functools.partial(hio.init, empty_map.config)), keys)
+    assert jax.tree.map(jnp.shape, made) == jax.tree.map(jnp.shape, maps)
+
+
+@pytest.mark.parametrize("key", [0, np.zeros(3), "0", None])
+def test_what_is_no_key_is_refused_with_a_key_that_is(empty_map, key):
+    with pytest.raises(ValueError, match=r"key .*expected one key, such as jax\.random\.key\(0\)"):
+        hio.init(empty_map.config, key)
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def endurance(setup: Setup) -> Measured:
     made = len(times_ms)
     tenth = max(1, made // 10)
     start, end = spread_of(times_ms[:tenth]), spread_of(times_ms[-tenth:])
-    flags = hio.Flag(int(state.report.flags))
+    flags = hio.Flag(state.report.flags)
     cut = f"stopped by --minutes, of {count:,}; " if made < count else ""
     medians = [f"{np.median(part):.2f}" for part in np.array_split(times_ms, min(10, made))]
     note = f"{cut}flags: {flags.name or 'none'}; medians of its tenths: {', '.join(medians)}"

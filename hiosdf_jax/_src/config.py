@@ -252,6 +252,13 @@ class Config:
     def paper(cls, bounds: Any, **overrides: Any) -> Config:
         """Returns the paper's network, samples and schedule; the network answers alone.
 
+        It changes these fields of the default:
+
+        - samples per update: local_points=1_000
+        - network: hidden_width=256
+        - training: eikonal_weight=2.0, eikonal_every=1
+        - queries: grid_share=0.0
+
         Args:
             bounds: ((x0, y0, z0), (x1, y1, z1)), m, world frame.
             **overrides: Any other field of `Config`.
@@ -267,6 +274,14 @@ class Config:
     @classmethod
     def light(cls, bounds: Any, **overrides: Any) -> Config:
         """Returns the same pipeline, sized for two CPU cores.
+
+        It changes these fields of the default:
+
+        - clouds: max_points=20_000
+        - samples per update: near_samples=8_000, far_samples=24_000, local_ray_samples=10
+        - network: hidden_layers=2
+        - training: eikonal_every=2, learning_rate=1e-3, batches=8, epochs=1, warmup_epochs=5
+        - queries: weight_average=0.8
 
         Args:
             bounds: ((x0, y0, z0), (x1, y1, z1)), m, world frame.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, Literal, NamedTuple, Self
+import operator
+from typing import Any, Literal, NamedTuple, Self, SupportsIndex, cast
 
 import flax.serialization
 import flax.struct
@@ -14,6 +15,7 @@ import optax
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.arrays import scalar
+from hiosdf_jax._src.numerics.describing import Described
 from hiosdf_jax._src.numerics.exporting import export_optimizer, exportable
 from hiosdf_jax._src.numerics.intake import is_traced
 
@@ -39,8 +41,10 @@ def frontier_step_m(config: Config) -> float:
 class Flag(enum.IntFlag):
     """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`.
 
+    `Flag` takes these arrays as they are; of a stack of maps it takes one after the other.
+
     Example:
-        >>> flags = hio.Flag(int(state.report.update_flags))
+        >>> flags = hio.Flag(state.report.update_flags)
         >>> hio.Flag.BAD_POSE in flags
         False
         >>> print(flags)
@@ -70,6 +74,16 @@ class Flag(enum.IntFlag):
     FUSED_AS_PREDICTED = 256
     """`track` fused the cloud at its predicted pose: the map was too young to register it."""
 
+    @classmethod
+    def _missing_(cls, value: object) -> Flag:
+        """Takes the bits of a report, which are an array."""
+        if isinstance(value, int):
+            return cast(Flag, super()._missing_(value))
+        try:
+            return cls(operator.index(cast(SupportsIndex, value)))
+        except TypeError as error:
+            raise ValueError(f"flags is {value!r}, expected an integer, as in a report") from error
+
     def __str__(self) -> str:
         """Returns the names of the flags with `|` between them, or "none"."""
         names = [str(flag.name) for flag in type(self) if flag & self]
@@ -82,7 +96,7 @@ class Flag(enum.IntFlag):
 
 
 @exportable()
-class Report(flax.struct.PyTreeNode):
+class Report(Described):
     """Summary of the last update; `flags` collects those of all updates.
 
     Updates that changed nothing else leave all numbers as they were, but for the flags and
@@ -116,7 +130,7 @@ class Report(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Evidence(flax.struct.PyTreeNode):
+class Evidence(Described):
     """What each voxel remembers of the rays that met it.
 
     Offsets are from the voxel's center, in voxels.
@@ -163,7 +177,7 @@ class Side(enum.IntEnum):
 
 
 @exportable()
-class Derived(flax.struct.PyTreeNode):
+class Derived(Described):
     """Distances of each voxel, derived from the evidence around it.
 
     Attributes:
@@ -187,7 +201,7 @@ class Derived(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Grid(flax.struct.PyTreeNode):
+class Grid(Described):
     """The coarse global grid.
 
     Attributes:
@@ -200,7 +214,7 @@ class Grid(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Surface(flax.struct.PyTreeNode):
+class Surface(Described):
     """What queries read of the grid.
 
     Attributes:
@@ -215,7 +229,7 @@ class Surface(flax.struct.PyTreeNode):
 
 
 @exportable()
-class Network(flax.struct.PyTreeNode):
+class Network(Described):
     """The SIREN and its optimizer.
 
     Attributes:
@@ -231,7 +245,7 @@ class Network(flax.struct.PyTreeNode):
     origin_world: jax.Array
 
 
-class _FloatLeaves(flax.struct.PyTreeNode):
+class _FloatLeaves(Described):
     """A pytree whose float leaves can be taken apart from the others, for `jax.grad`."""
 
     def differentiable(self) -> Self:
@@ -374,17 +388,32 @@ def _from_flax(state: MapState, data: dict[str, Any]) -> MapState:
 flax.serialization.register_serialization_state(MapState, _to_flax, _from_flax, override=True)
 
 
-def check_map(state: Any, stacked: bool = False, name: str = "state") -> None:
-    """Raises a ValueError if an argument is not a map, or not a single one."""
+_ONE_OF_THEM = "for one of them use jax.tree.map(lambda x: x[i], maps)"
+
+
+def check_map(
+    state: Any, stacked: bool = False, name: str = "state", batched: str | None = None
+) -> None:
+    """Checks that an argument is a map.
+
+    Args:
+        state: The argument.
+        stacked: Whether it may be a stack of maps.
+        name: Name of the argument in error messages.
+        batched: The call that does the same for a stack, for error messages.
+
+    Raises:
+        ValueError: It is no map, or a stack, or was donated.
+    """
     if not isinstance(state, MapState):
         raise ValueError(f"{name} is {type(state).__name__}, expected a MapState from hio.init")
     if stacked:
         _check_kept(name, state)
     else:
-        check_single(name, state)
+        check_single(name, state, batched)
 
 
-def check_single(name: str, field: MapState | Field | Baked) -> None:
+def check_single(name: str, field: MapState | Field | Baked, batched: str | None = None) -> None:
     """Raises a ValueError if an argument is a stack of maps, or arrays that do not match."""
     _check_kept(name, field)
     if isinstance(field, Baked):
@@ -395,13 +424,10 @@ def check_single(name: str, field: MapState | Field | Baked) -> None:
                 "expected equal ones"
             )
     voxels = _voxels(field)
-    axes = np.ndim(voxels) - 3
-    if axes:
-        raise ValueError(
-            f"{name} has voxels of shape {np.shape(voxels)}, expected those of one map: for "
-            f"{np.shape(voxels)[0]} maps at once use jax.vmap, for example "
-            f"jax.vmap(hio.sdf, in_axes=(0, None))(fields, points)"
-        )
+    shape = np.shape(voxels)
+    if len(shape) != 3:
+        advice = f"for {shape[0]} maps at once use {batched}" if batched else _ONE_OF_THEM
+        raise ValueError(f"{name} has voxels of shape {shape}, expected those of one map: {advice}")
 
 
 def _check_kept(name: str, field: MapState | Field | Baked) -> None:
@@ -435,11 +461,12 @@ def field_of(state: MapState) -> Field:
     )
 
 
-def as_live_field(field: MapState | Field) -> Field:
+def as_live_field(field: MapState | Field, batched: str | None = None) -> Field:
     """Selects what queries read of a map or of a snapshot, without a copy.
 
     Args:
         field: A map or a snapshot of one.
+        batched: As for `check_map`.
 
     Returns:
         The field.
@@ -450,5 +477,5 @@ def as_live_field(field: MapState | Field) -> Field:
     """
     if not isinstance(field, MapState | Field):
         raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
-    check_single("field", field)
+    check_single("field", field, batched)
     return field_of(field) if isinstance(field, MapState) else field

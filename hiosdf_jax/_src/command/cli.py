@@ -298,7 +298,10 @@ def _eval(options: argparse.Namespace) -> None:
         reason = "has no exact distances, expected --ground-truth"
         raise Failure(f"{options.stream} {reason}", BAD_INPUT)
     scores = checked(lambda: score_map(options.map, state, truth))
-    print(f"{table.format_table(scores['scores'])}\n\n{table.format_bands(scores['bands'])}")
+    texts = [table.format_table(scores["scores"]), table.format_bands(scores["bands"])]
+    if "not_scored" in scores:
+        texts.insert(1, table.format_reasons(scores["not_scored"]))
+    print("\n\n".join(texts))
     if options.to is not None:
         write_json(options.to, scores)
         print(f"\nwrote {options.to}")

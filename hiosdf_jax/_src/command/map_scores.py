@@ -24,7 +24,7 @@ def score_map(
         truth: Exact distances.
 
     Returns:
-        `scores` and `bands`, as in `metrics.json`.
+        `scores` and `bands`, and `not_scored` if a score has no value, as in `metrics.json`.
 
     Raises:
         ValueError: The map had not come to any of the exact distances.
@@ -39,4 +39,5 @@ def score_map(
     scores = metrics.evaluate(queries.sdf_and_grad, truth, None, last_frame)
     scores |= metrics.evaluate_lower(queries.lower, truth, last_frame)
     bands = metrics.evaluate_bands(queries.sdf_and_grad, truth, None, last_frame)
-    return {"scores": scores, "bands": bands}
+    missing = metrics.explain_missing(truth, last_frame)
+    return {"scores": scores, "bands": bands} | ({"not_scored": missing} if missing else {})

@@ -229,4 +229,5 @@ def _score(queries: CompiledQueries, mapped: Mapped, truth: GroundTruth) -> dict
     scores = metrics.evaluate(queries.sdf_and_grad, truth, sensor_world, last_frame)
     scores |= metrics.evaluate_lower(queries.lower, truth, last_frame)
     bands = metrics.evaluate_bands(queries.sdf_and_grad, truth, sensor_world, last_frame)
-    return {"scores": scores, "bands": bands}
+    missing = metrics.explain_missing(truth, last_frame)
+    return {"scores": scores, "bands": bands} | ({"not_scored": missing} if missing else {})

@@ -40,13 +40,17 @@ def describe(mapped: Mapped, config: Config) -> dict[str, Any]:
     Returns:
         Counts, times, flags, the configuration and the device, by the keys of `metrics.json`.
     """
-    later_ms = 1000 * mapped.update_seconds[1:]  # the first update compiles
-    flags = int(mapped.state.report.flags)
+    updates, flags = int(mapped.state.updates), int(mapped.state.report.flags)
+    times_ms = 1000 * mapped.update_seconds
+    before = max(updates - len(times_ms), 0)  # in the run that this one continues
+    warm = max(config.warmup_updates - before, 1)  # they train longer, and the first one compiles
+    warmup_ms, later_ms = times_ms[1:warm], times_ms[warm:]
     return {
-        "updates": int(mapped.state.updates),
+        "updates": updates,
         "frames_skipped": mapped.skipped,
         "stopped_by": None if mapped.stopped is None else str(mapped.stopped),
         "compile_s": float(mapped.update_seconds[0]) if len(mapped.update_seconds) else math.nan,
+        "warmup_median_ms": float(np.median(warmup_ms)) if len(warmup_ms) else math.nan,
         "update_median_ms": float(np.median(later_ms)) if len(later_ms) else math.nan,
         "update_p90_ms": float(np.percentile(later_ms, 90)) if len(later_ms) else math.nan,
         "points_used": mapped.progress.points_used,
@@ -68,6 +72,7 @@ def summarize(metrics: dict[str, Any]) -> str:
     """
     times = [
         f"first {metrics['compile_s']:.1f} s (it compiles)",
+        f"{metrics['warmup_median_ms']:.0f} ms while warming up",
         f"then {metrics['update_median_ms']:.0f} ms (median)",
         f"{metrics['update_p90_ms']:.0f} ms (90 % below)",
     ]
@@ -96,6 +101,8 @@ def summarize(metrics: dict[str, Any]) -> str:
     scores = metrics.get("scores") or metrics.get("held_out")
     if scores:
         lines += ["", table.format_table(scores), ""]
+    if "not_scored" in metrics:
+        lines += [table.format_reasons(metrics["not_scored"]), ""]
     if "bands" in metrics:
         lines += [table.format_bands(metrics["bands"]), ""]
     return "\n".join(lines)

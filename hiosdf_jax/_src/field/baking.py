@@ -49,7 +49,7 @@ def bake(
     Example:
         >>> baked = hio.bake(field, resolution=0.05, center=robot_position, size=(4, 4, 2))
     """
-    field = as_live_field(field)
+    field = as_live_field(field, "jax.vmap(lambda field: hio.bake(field, resolution))(fields)")
     if (center is None) != (size is None):
         raise ValueError("center and size define a window, expected both or neither")
     if size is None:

@@ -33,6 +33,8 @@ _FAR = 1e30  # m
 # where the frontier takes over.
 _DEEP_M = 0.4
 
+_BATCHED = "jax.vmap, for example jax.vmap(hio.sdf, in_axes=(0, None))(fields, points)"
+
 AnyField = MapState | Field | Baked
 
 
@@ -155,7 +157,7 @@ def as_field(field: AnyField) -> Field | Baked:
         raise ValueError(
             f"field is {type(field).__name__}, expected a MapState, a Field or a Baked"
         )
-    check_single("field", field)
+    check_single("field", field, _BATCHED)
     return field
 
 

@@ -37,7 +37,7 @@ def init(config: Config, key: jax.Array) -> MapState:
     """
     if not isinstance(config, Config):
         raise ValueError(f"config is {type(config).__name__}, expected a hiosdf_jax.Config")
-    key = as_key("key", key)
+    key = as_key("key", key, batched="jax.vmap(functools.partial(hio.init, config))(keys)")
     key, network_key = jax.random.split(key)
 
     def zero() -> jax.Array:  # one array per leaf, so that the state can be donated
@@ -69,7 +69,7 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
     """Copies what queries need, so that a planner can hold it while the map is updated.
 
     Args:
-        state: The map.
+        state: The map, or a stack of maps.
         stamp: Time of the snapshot, s on the caller's clock. It is stored as float32, so count from
             the start of the run.
 
@@ -88,7 +88,9 @@ def snapshot(state: MapState, stamp: float | jax.Array = 0.0) -> Field:
     if seconds.shape != () or not (is_traced(seconds) or np.isfinite(jax.device_get(seconds))):
         raise ValueError(f"stamp is {stamp!r}, expected a finite number of seconds")
     field = jax.tree.map(jnp.copy, field_of(state))
-    return field.replace(stamp=on_device("stamp", seconds))
+    # A stack of maps has a stamp for each, so that `vmap` can take its fields apart.
+    stamps = jnp.broadcast_to(on_device("stamp", seconds), jnp.shape(state.updates))
+    return field.replace(stamp=stamps)
 
 
 def grow(state: MapState, bounds: Any) -> MapState:

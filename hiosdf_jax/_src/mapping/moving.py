@@ -53,7 +53,7 @@ def moving_rows(
         >>> moving = hio.moving_rows(state, cloud, pose)
         >>> state = hio.update(state, cloud, pose)
     """
-    check_map(state)
+    check_map(state, batched="jax.vmap(hio.moving_rows)(maps, clouds, poses)")
     extras = check_extras(robot, noise)
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
         return _moving_rows(state, *as_traced(cloud, pose), *extras)

@@ -69,7 +69,8 @@ def update(
             `planning.place_spheres`. The centers are in the world frame, at the time of the cloud.
             Returns on them leave no surface and clear no space: those within 3 cm, or three
             standard deviations of their range if that is more. Surfaces that were mapped inside
-            the spheres are removed, and their space counts as free.
+            the spheres are removed, and the voxels that held them count as free; unseen space
+            stays unseen.
         noise: (a, b) of the standard deviation a + b r^2 of this cloud's returns at range r, m and
             1/m, for sensors of different quality. By default it is `config.range_noise`. Where it
             is given and exceeds a fifth of a voxel, ranges are averaged over neighboring rays.
@@ -92,7 +93,7 @@ def update(
         >>> for cloud, pose in stream:
         ...     state = hio.update(state, cloud, pose)
     """
-    check_map(state)
+    check_map(state, batched="jax.vmap(hio.update)(maps, clouds, poses)")
     extras = check_extras(robot, noise)
     if is_traced(*jax.tree.leaves((state, extras)), cloud, pose):
         return run_update(state, *as_traced(cloud, pose), extras)

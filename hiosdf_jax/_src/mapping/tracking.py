@@ -79,7 +79,7 @@ def track(
         ...     if found.converged:
         ...         last, reference = found, i
     """
-    check_map(state)
+    check_map(state, batched="jax.vmap(hio.track)(maps, clouds, poses)")
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
     traced = is_traced(*jax.tree.leaves((state, prior, checked_noise, reach)))

@@ -147,12 +147,13 @@ def check_whole(name: str, value: Any, least: int, most: int = _MOST_WHOLE) -> N
         raise ValueError(f"{name} is {value!r}, expected at most {most}")
 
 
-def as_key(name: str, key: Any) -> jax.Array:
+def as_key(name: str, key: Any, batched: str | None = None) -> jax.Array:
     """Checks that an argument is one random key.
 
     Args:
         name: Name of the argument in error messages.
         key: From `jax.random.key`, or an older one from `PRNGKey`; may be traced.
+        batched: The call that takes several keys, for error messages.
 
     Returns:
         The typed key.
@@ -160,17 +161,19 @@ def as_key(name: str, key: Any) -> jax.Array:
     Raises:
         ValueError: It is something else, or several keys.
     """
+    expected = "expected one key, such as jax.random.key(0)"
     try:
         array = key if isinstance(key, jax.Array) else jnp.asarray(key)
     except Exception as error:  # whatever a third-party object raises
-        raise ValueError(f"{name} is {type(key).__name__}, expected one jax.random.key") from error
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) and array.shape == ():
+        raise ValueError(f"{name} is {type(key).__name__}, {expected}") from error
+    is_typed = jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
+    if is_typed and array.shape == ():
         return array
     if array.dtype == jnp.uint32 and array.shape == (2,):
         return jax.random.wrap_key_data(array)
-    raise ValueError(
-        f"{name} has dtype {array.dtype} and shape {array.shape}, expected one jax.random.key"
-    )
+    if is_typed and batched:
+        expected += f"; for {array.shape[0]} of them use {batched}"
+    raise ValueError(f"{name} has dtype {array.dtype} and shape {array.shape}, {expected}")
 
 
 def as_traced(cloud: Any, pose: Any) -> tuple[jax.Array, jax.Array]:

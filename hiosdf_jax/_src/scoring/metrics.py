@@ -158,6 +158,21 @@ def evaluate(
     return {key: scores[key] for key in METRICS if key in scores}
 
 
+def explain_missing(truth: GroundTruth, last_frame: int | None) -> dict[str, str]:
+    """Says why scores of `evaluate` have no value.
+
+    Args:
+        truth: As in `evaluate`.
+        last_frame: As in `evaluate`.
+
+    Returns:
+        {metric: reason}, for the metrics that these frames leave without a value.
+    """
+    if last_frame is None or (np.asarray(truth.frame) <= last_frame).all():
+        return {}
+    return {"surface_cm": "it is scored once all frames are mapped: surface points carry no frame"}
+
+
 def evaluate_bands(
     sdf_and_grad: Callable[[np.ndarray], tuple[Any, Any]],
     truth: GroundTruth,

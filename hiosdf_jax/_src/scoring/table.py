@@ -29,6 +29,18 @@ def format_table(scores: Mapping[str, float]) -> str:
     return lay_out(cells, text_columns=3)
 
 
+def format_reasons(reasons: Mapping[str, str]) -> str:
+    """Formats why scores have no value.
+
+    Args:
+        reasons: From `explain_missing`.
+
+    Returns:
+        A line for each of them.
+    """
+    return "\n".join(f"{METRICS[key].label}: {reason}" for key, reason in reasons.items())
+
+
 def format_bands(bands: Mapping[str, Mapping[str, float]]) -> str:
     """Formats scores by band of the true distance as a table.
 

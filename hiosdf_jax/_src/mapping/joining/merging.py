@@ -59,7 +59,7 @@ def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
         >>> moved = hio.transform(state, pose)
         >>> hio.sdf(moved, points @ pose[:3, :3].T + pose[:3, 3])  # about hio.sdf(state, points)
     """
-    check_map(state)
+    check_map(state, batched="jax.vmap(hio.transform)(maps, poses)")
     config = _in_bounds(state.config, bounds)
     matrix = _checked_pose("pose", pose)
     joined = _join if is_traced(*jax.tree.leaves(state), matrix) else _join_jit
@@ -91,8 +91,9 @@ def merge(a: MapState, b: MapState, pose_a_b: Any) -> MapState:
     Example:
         >>> both = hio.merge(hio.grow(a, bounds), b, pose_a_b)
     """
-    check_map(a, name="a")
-    check_map(b, name="b")
+    batched = "jax.vmap(hio.merge)(maps_a, maps_b, poses)"
+    check_map(a, name="a", batched=batched)
+    check_map(b, name="b", batched=batched)
     _check_fits("a", a, "b", b)
     matrix = _checked_pose("pose_a_b", pose_a_b)
     joined = _join if is_traced(*jax.tree.leaves((a, b)), matrix) else _join_jit

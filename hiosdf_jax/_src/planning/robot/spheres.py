@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.arrays import on_device
+from hiosdf_jax._src.numerics.describing import Described
 from hiosdf_jax._src.numerics.exporting import exportable
 from hiosdf_jax._src.numerics.gradient import least
 from hiosdf_jax._src.numerics.intake import as_number
@@ -36,7 +36,7 @@ from hiosdf_jax._src.state import Bound
 
 
 @exportable()
-class RobotSpheres(flax.struct.PyTreeNode):
+class RobotSpheres(Described):
     """Spheres on the bodies of a robot; made by `spheres_from_model`.
 
     Attributes:
