@@ -164,7 +164,7 @@ def test_a_folder_of_clouds_without_poses_is_mapped_by_odometry(
     found = np.stack([pose_at(timed, stamp, 0.1) for stamp in timed.stamps])
     assert way_cm(found, from_first(exact)).max() < 3
     metrics = json.loads((output / "metrics.json").read_text("utf-8"))
-    assert (metrics["updates"], metrics["flags"]) == (FRAMES, [])
+    assert (metrics["updates"], metrics["flags"]) == (FRAMES, ["FUSED_AS_PREDICTED"])
     low, high = np.array(boxes[-1])
     seen = np.concatenate(clouds)  # walls at 0.97, 0.78 and 0.56 m
     np.testing.assert_allclose(low, seen.min(axis=0) - 3, atol=0.1)
@@ -248,7 +248,7 @@ def test_the_velocity_is_kept_over_missing_frames(stamps, seconds):
     for frame in (1, 2):
         pose = screw(0.1 * frame)
         found = Registration(pose, np.eye(6), 0.0, 0.0, True)
-        tracked._add(frame, np.eye(4), pose, found)
+        tracked._add(frame, np.eye(4), found, True)
     np.testing.assert_allclose(tracked.predict(np.eye(4), 5), screw(seconds), atol=1e-3)
 
 
