@@ -77,9 +77,8 @@ SHIFTS_M = {
     0.5: ((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)),
 }
 
-# A frame counts as found within this, m and degrees. A place is sure if its margin is larger.
+# A frame counts as found within this, m and degrees.
 FOUND = 0.05, 1.0
-SURE_MARGIN = 0.1
 
 
 def change(exact, mode, seed=0):
@@ -241,8 +240,7 @@ def print_relocalization(stream, frames, numbers, field, up_world):
         away = error(place.best.pose, pose)
         way, angle = np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))
         right, score, other = way < FOUND[0] and angle < FOUND[1], place.score, place.other_score
-        sure = bool(place.best.converged) and float(score - other) > SURE_MARGIN
-        places.append([right, bool(place.best.converged), sure])
+        places.append([right, bool(place.best.converged), bool(place.sure)])
         if not right:
             print(
                 f"frame {i}: {way:.2f} m and {angle:.1f} deg off, score {float(score):.2f}, "

@@ -66,6 +66,32 @@ def test_the_identity_keeps_the_map(room_map):
     assert arrays_equal(ask(same, POINTS), ask(room_map, POINTS))
 
 
+def test_surfaces_that_leave_the_box_are_reported(room_map):
+    """A shift by 0.6 m loses one wall and parts of four sides; one by 5 m loses all."""
+    for shift, least in ((0.6, 0.1), (5.0, 1.0)):
+        with pytest.warns(UserWarning, match="% of the surface patches fall outside") as caught:
+            moved = hio.transform(room_map, pose_of((0, 0, 0), (shift, 0, 0)))
+        share = float(str(caught[0].message).split()[0]) / 100
+        lost = 1 - features(moved) / features(room_map)
+        np.testing.assert_allclose(share, lost, atol=0.01)
+        assert share >= least
+        assert hio.Flag.POINTS_OUTSIDE in hio.Flag(moved.report.update_flags)
+
+
+def test_a_larger_box_loses_no_surface(room_map):
+    bounds = tuple(tuple(6 * np.array(corner)) for corner in BOUNDS)
+    moved = hio.transform(room_map, pose_of((0, 0, 0), (2, 0, 0)), bounds)
+    assert features(moved) == features(room_map)
+    assert hio.Flag.POINTS_OUTSIDE not in hio.Flag(moved.report.update_flags)
+
+
+def features(state):
+    """Number of the voxels whose patch counts as surface."""
+    known = state.grid.evidence
+    hits, passes = (jnp.asarray(part, jnp.float32) for part in (known.hits, known.passes))
+    return int(jnp.sum(patches.is_feature(state.config, hits, passes, known.axes)))
+
+
 @pytest.mark.parametrize("rotvec", [(0, 0, 0), (0, 0, np.pi)])
 def test_whole_voxels_and_half_turns_answer_as_before(room_map, rotvec):
     """The box of the room is symmetric: nothing leaves it by a half turn."""
@@ -80,7 +106,8 @@ def test_whole_voxels_and_half_turns_answer_as_before(room_map, rotvec):
 
 def test_an_oblique_move_loses_little_and_says_so_by_frontier(sharp_map):
     pose = pose_of((0.2, -0.1, 0.7), (0.05, 0.02, -0.04))
-    moved = hio.transform(sharp_map, pose)
+    with pytest.warns(UserWarning, match="12 % of the surface patches"):
+        moved = hio.transform(sharp_map, pose)
     there = moved_points(pose, POINTS)
     assert error_cm(moved, there, room_sdf(POINTS)) < 1.5 * error_cm(sharp_map) + 0.2
     seen, before = (ask(*pair).observed for pair in ((moved, there), (sharp_map, POINTS)))
@@ -154,8 +181,8 @@ def test_inside_jit_a_bad_pose_is_flagged_and_adds_nothing(room_map, empty_map):
     for call in (hio.transform, lambda state, pose: hio.merge(state, state, pose)):
         assert jax.eval_shape(call, room_map, bad).config == CONFIG
     # What these run inside the user's jit, compiled once for all tests.
-    kept = merging._join_jit(CONFIG, ((room_map, bad),))
-    total = merging._join_jit(CONFIG, ((empty_map, None), (room_map, bad)))
+    kept, _ = merging._join_jit(CONFIG, ((room_map, bad),))
+    total, _ = merging._join_jit(CONFIG, ((empty_map, None), (room_map, bad)))
     for state, expected in ((kept, room_map), (total, empty_map)):
         assert hio.Flag.BAD_POSE in hio.Flag(state.report.update_flags)
         assert arrays_equal(state.grid.evidence.hits, expected.grid.evidence.hits)

@@ -88,6 +88,7 @@ def test_the_place_is_found(seed):
     assert bool(found.best.converged)
     assert float(found.score) > 0.95
     assert float(found.other_score) < float(found.score) - 0.03
+    assert bool(found.sure) == (float(found.other_score) < float(found.score) - 0.1)
 
 
 def test_rows_that_are_no_returns_change_nothing():
@@ -119,6 +120,7 @@ def test_a_symmetric_room_has_two_answers():
     ]
     assert max(errors) < 0.01
     assert abs(float(found.score) - float(found.other_score)) < 0.02
+    assert not bool(found.sure)
     way, turn = away(found.best.pose, np.asarray(found.other.pose, float))
     assert way > 0.4
     assert turn > 3
@@ -197,6 +199,7 @@ def test_an_empty_map_knows_no_place(empty_map):
     found = hio.relocalize(empty_map, cloud, jax.random.key(0), HYPOTHESES)
     assert not bool(found.best.converged)
     assert float(found.score) == 0
+    assert not bool(found.sure)
     assert np.isfinite(np.asarray(found.best.pose)).all()
 
 

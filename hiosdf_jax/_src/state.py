@@ -56,7 +56,8 @@ class Flag(enum.IntFlag):
     EMPTY_CLOUD = 2
     """A cloud had no finite row. That update changed nothing else."""
     POINTS_OUTSIDE = 4
-    """Returns in range fell outside the bounds. Their rays cleared space but left no surface."""
+    """Returns in range fell outside the bounds. Their rays cleared space but left no surface. Or
+    surfaces of a map that was moved or merged fell outside, and are lost."""
     TRAINING_FAILED = 8
     """Training was not finite. The network was kept as it was, and the next update trains it again;
     the optimizer is reset if it was the cause."""

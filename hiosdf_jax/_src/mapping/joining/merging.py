@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid, whole_window, write_window
 from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.mapping.joining.adding import Moved, sum_evidence
-from hiosdf_jax._src.mapping.joining.rebinning import coincides, passes_at, rebin
+from hiosdf_jax._src.mapping.joining.rebinning import coincides, count_lost, passes_at, rebin
 from hiosdf_jax._src.network.frames import move_network
 from hiosdf_jax._src.network.training import least_epochs, train
 from hiosdf_jax._src.numerics.intake import as_array, check_pose, is_traced
@@ -30,6 +31,9 @@ _SHARED = ("voxel_size", "range_noise", "hidden_width", "hidden_layers", "freque
 # After a merge the network learns what the other map knew, in this many trainings of
 # `Config.warmup_epochs` on samples of the whole grid. Each keeps half of the old average.
 _TRAININGS = 10
+
+# Outside jit a warning says if a larger share of the surface falls outside of the box.
+_MOST_LOST = 0.01
 _AVERAGE = 0.5
 
 
@@ -39,7 +43,8 @@ def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
     The network is the same in its new frame, and answers as before up to rounding. The grid is
     re-binned: patches move exactly and those that meet in a voxel add up; observed space shrinks
     by up to a voxel. By whole voxels and turns of 90 degrees, the grid is only re-indexed. What
-    falls outside of the new box is lost.
+    falls outside of the new box is lost: surfaces there raise `Flag.POINTS_OUTSIDE`, and outside
+    jit a warning if they are more than 1 % of all.
 
     Args:
         state: The map.
@@ -62,15 +67,15 @@ def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
     check_map(state, batched="jax.vmap(hio.transform)(maps, poses)")
     config = _in_bounds(state.config, bounds)
     matrix = _checked_pose("pose", pose)
-    joined = _join if is_traced(*jax.tree.leaves(state), matrix) else _join_jit
-    return joined(config, ((state, matrix),))
+    return _joined(config, ((state, matrix),))
 
 
 def merge(a: MapState, b: MapState, pose_a_b: Any) -> MapState:
     """Adds a map to another one, without the clouds of either.
 
     Hits, passes and the moments of patches add up, as if one map had met the rays of both. Only
-    what lies in the box of `a` is added: `grow` it first. The network of `a` is trained on the
+    what lies in the box of `a` is added: `grow` it first. Surfaces outside are lost, as in
+    `transform`. The network of `a` is trained on the
     merged grid.
 
     Args:
@@ -96,8 +101,7 @@ def merge(a: MapState, b: MapState, pose_a_b: Any) -> MapState:
     check_map(b, name="b", batched=batched)
     _check_fits("a", a, "b", b)
     matrix = _checked_pose("pose_a_b", pose_a_b)
-    joined = _join if is_traced(*jax.tree.leaves((a, b)), matrix) else _join_jit
-    return joined(a.config, ((a, None), (b, matrix)))
+    return _joined(a.config, ((a, None), (b, matrix)))
 
 
 def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapState:
@@ -135,18 +139,40 @@ def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapS
     matrices = as_array("poses", poses)
     if matrices.shape != (len(submaps), 4, 4):
         raise ValueError(f"poses has shape {matrices.shape}, expected ({len(submaps)}, 4, 4)")
-    traced = is_traced(*jax.tree.leaves(list(submaps)), matrices)
     if not is_traced(matrices):
         checked = [check_pose(pose, f"poses[{i}]") for i, pose in enumerate(np.asarray(matrices))]
         matrices = jax.device_put(np.stack(checked))
     config = _in_bounds(submaps[0].config, bounds)
-    parts = tuple(zip(submaps, matrices, strict=True))
-    return (_join if traced else _join_jit)(config, parts)
+    return _joined(config, tuple(zip(submaps, matrices, strict=True)))
+
+
+def _joined(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) -> MapState:
+    """Calls `_join`, outside jit compiled; there it warns of what is lost."""
+    if is_traced(*jax.tree.leaves(parts)):
+        return _join(config, parts)[0]
+    result, lost = _join_jit(config, parts)
+    if float(lost) > _MOST_LOST:
+        warnings.warn(
+            f"{100 * float(lost):.2g} % of the surface patches fall outside of the box and are "
+            f"lost: pass larger bounds than {config.bounds}, or grow the map first",
+            stacklevel=3,
+        )
+    return result
 
 
 @plain
-def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) -> MapState:
-    """Joins maps at poses T_world_map in one box; None leaves a map of this very box as it is."""
+def _join(
+    config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]
+) -> tuple[MapState, jax.Array]:
+    """Joins maps in one box.
+
+    Args:
+        config: The configuration of the result.
+        parts: Maps and their poses T_world_map; None leaves a map of this very box as it is.
+
+    Returns:
+        The map, and the share of the surface patches that fall outside of the box, ().
+    """
     states, eye = [state for state, _ in parts], jnp.eye(4, dtype=jnp.float32)
     good = [jnp.asarray(True) if pose is None else is_rigid(pose) for _, pose in parts]
     # A map that is only moved is kept in any case; of several, those that can be placed.
@@ -155,11 +181,18 @@ def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) 
         used = [ok & (state.updates > 0) for ok, state in zip(good, states, strict=True)]
 
     windows, moved, networks = [], [], []
+    lost = patches = jnp.int32(0)
     for (state, pose), ok, use in zip(parts, good, used, strict=True):
         exact = None if pose is None else _exact(jnp.where(ok, pose, eye))
-        networks.append(state.network if exact is None else move_network(state.network, exact))
         known = state.grid.evidence
-        window = whole_window(known) if exact is None else rebin(state.config, known, config, exact)
+        if exact is None:
+            window = whole_window(known)
+            networks.append(state.network)
+        else:
+            window = rebin(state.config, known, config, exact)
+            networks.append(move_network(state.network, exact))
+            own_lost, own = count_lost(state.config, known, config, exact)
+            lost, patches = lost + jnp.where(use, own_lost, 0), patches + jnp.where(use, own, 0)
         window = jax.tree.map(lambda x, use=use: jnp.where(use, x, jnp.zeros_like(x)), window)
         windows.append(window)
         moved.append(None if exact is None else _moved(state, config, exact, use))
@@ -181,6 +214,7 @@ def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) 
             jnp.sum(mapped) > 1, lambda *x: _learn(config, *x), _skip, grid, network, key
         )
     flags = jnp.where(jnp.all(jnp.stack(good)), 0, Flag.BAD_POSE)
+    flags |= jnp.where(lost > 0, Flag.POINTS_OUTSIDE, 0)
     flags = (flags | jnp.where(trained, 0, Flag.TRAINING_FAILED)).astype(jnp.uint32)
     report = states[0].report
     for state in states[1:]:
@@ -198,7 +232,8 @@ def _join(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]) 
         updates=jnp.asarray(updates, jnp.int32),
         report=report,
     )
-    return jax.tree.map(jnp.copy, result)  # so that each map can be donated
+    # Copied, so that each map can be donated.
+    return jax.tree.map(jnp.copy, result), lost / jnp.maximum(patches, 1)
 
 
 def _moved(state: MapState, config: Config, pose: jax.Array, used: jax.Array) -> Moved:

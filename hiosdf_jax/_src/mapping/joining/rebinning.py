@@ -124,6 +124,46 @@ class _FreeSpace(NamedTuple):
     change: jax.Array
 
 
+def count_lost(
+    source: Config, evidence: Evidence, target: Config, pose: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Counts the surface patches that `rebin` loses, as they fall outside of the new grid.
+
+    Args:
+        source: The configuration of the grid.
+        evidence: Its evidence.
+        target: The configuration of the new grid, with the same voxel size.
+        pose: (4, 4) T_target_source.
+
+    Returns:
+        Patches that are lost, and all patches, () int32 each.
+    """
+    _, _, cell = _move_means(source, evidence, target, pose)
+    _, inside = _index_of(target, cell)
+    hits, passes = (array.ravel().astype(jnp.float32) for array in (evidence.hits, evidence.passes))
+    is_surface = patches.is_feature(source, hits, passes, evidence.axes.reshape(-1, 3, 3))
+    return jnp.sum(is_surface & ~inside), jnp.sum(is_surface)
+
+
+def _move_means(
+    source: Config, evidence: Evidence, target: Config, pose: jax.Array
+) -> tuple[Vector, Vector, Vector]:
+    """Moves voxels with their patches.
+
+    The centers and the offsets are apart, so that no digits are lost.
+
+    Returns:
+        The centers of the voxels, the means of the patches relative to them, and the cells in which
+        the means lie, (V,) each, in voxels of the new frame.
+    """
+    rotation, shift = pose[:3, :3], split(pose[:3, 3] / target.voxel_size)
+    row = jnp.arange(evidence.hits.size, dtype=jnp.int32)
+    center = _center(source, geometry.unflatten(source.grid_shape, row))
+    center = each(jnp.add, _rotated(rotation, center), shift)
+    offset = _rotated(rotation, split(evidence.mean.reshape(-1, 3).astype(jnp.float32)))
+    return center, offset, each(lambda c, o: jnp.floor(c + _INNER * o), center, offset)
+
+
 def _move_patches(
     source: Config, evidence: Evidence, target: Config, pose: jax.Array
 ) -> tuple[EvidenceWindow, jax.Array]:
@@ -135,7 +175,7 @@ def _move_patches(
     Returns:
         The evidence of each voxel with a patch, raveled, and how sure the patch is, (V,) int32.
     """
-    rotation, shift = pose[:3, :3], split(pose[:3, 3] / target.voxel_size)
+    rotation = pose[:3, :3]
     count, shape = evidence.hits.size, target.grid_shape
     voxels = shape[0] * shape[1] * shape[2]
     hits, passes, behind, root_weight = (
@@ -143,15 +183,9 @@ def _move_patches(
         for array in (evidence.hits, evidence.passes, evidence.behind, evidence.root_weight)
     )
     change = evidence.change.ravel().astype(jnp.int32)
-    mean = split(evidence.mean.reshape(-1, 3).astype(jnp.float32))
     axes = evidence.axes.reshape(-1, 3, 3)
-
-    # In voxels of the new frame. The centers and the offsets apart, so that no digits are lost.
     row = jnp.arange(count, dtype=jnp.int32)
-    center = _center(source, geometry.unflatten(source.grid_shape, row))
-    center = each(jnp.add, _rotated(rotation, center), shift)
-    offset = _rotated(rotation, mean)
-    cell = each(lambda c, o: jnp.floor(c + _INNER * o), center, offset)
+    center, offset, cell = _move_means(source, evidence, target, pose)
     offset = each(lambda c, k, o: (c - k - 0.5) + o, center, cell, offset)
     index, inside = _index_of(target, cell)
     voxel = jnp.where(inside, geometry.flat_index(shape, index), voxels)

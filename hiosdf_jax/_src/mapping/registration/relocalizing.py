@@ -80,6 +80,9 @@ _PLACES = 4
 _SCORED_ROWS = 2048
 _FITS_M = 0.05
 
+# A place is sure if its score exceeds that of any other place by this.
+_SURE_MARGIN = 0.1
+
 # Poses within this many meters and radians of each other are one place.
 _PLACE_M, _PLACE_RAD = 0.5, 0.3
 
@@ -90,14 +93,20 @@ class Relocalization(NamedTuple):
     Attributes:
         best: The pose at which the cloud fits best.
         score: Share of the cloud's returns that lie within 5 cm of a surface there, () float32.
-        other: The best pose at another place, at least 0.5 m or 17 degrees away.
-        other_score: The same share there. If it is close to `score`, the place is ambiguous.
+        other: The best pose at another place, at least 0.5 m or 17 degrees away. If there is none,
+            `best` again.
+        other_score: The same share there, or 0. If it is close to `score`, the place is ambiguous.
     """
 
     best: Registration
     score: jax.Array
     other: Registration
     other_score: jax.Array
+
+    @property
+    def sure(self) -> jax.Array:
+        """Whether `best` has converged and fits clearly better than another place, () bool."""
+        return self.best.converged & (self.score > self.other_score + _SURE_MARGIN)
 
 
 def relocalize(
@@ -126,8 +135,8 @@ def relocalize(
         up_world: The direction against gravity in the map's frame, (3,).
 
     Returns:
-        The best pose, and the best one at another place. Trust the best one if it has converged,
-        its score is high, and the other one's is clearly lower.
+        The best pose, and the best one at another place. Trust the best one if `sure` is True: it
+        has converged, and its score exceeds the other one's by 0.1.
 
     Raises:
         ValueError: A type or shape is wrong, or `hypotheses` is too small. Outside jit also: the
@@ -135,7 +144,8 @@ def relocalize(
 
     Example:
         >>> place = hio.relocalize(hio.load("map.npz"), cloud, jax.random.key(0))
-        >>> sure = place.best.converged & (place.score > place.other_score + 0.1)
+        >>> if place.sure:
+        ...     pose = place.best.pose
     """
     field = as_field(field)
     if hypotheses is None:
