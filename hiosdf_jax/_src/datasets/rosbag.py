@@ -18,17 +18,21 @@ import os
 import struct
 import weakref
 from collections import defaultdict
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hiosdf_jax._src.datasets.bag_frames import (
+    Transform,
+    find_tree,
+    frame_name,
+    unique_path_up,
+)
 from hiosdf_jax._src.datasets.files import most_returns, open_regular, parsing
 from hiosdf_jax._src.datasets.inflating import limit_rosbags
-from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
-from hiosdf_jax._src.datasets.timed_poses import TimedPoses, check_unique
-from hiosdf_jax._src.datasets.transforms import Edge, moves, moving, path_up, transform_up
+from hiosdf_jax._src.datasets.stream import FrameStream
+from hiosdf_jax._src.datasets.transforms import transform_up
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -38,9 +42,6 @@ _CLOUD = "sensor_msgs/msg/PointCloud2"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField's
-
-_Row = tuple[float, Any, Any]  # stamp, translation, rotation
-_Transform = tuple[str, str, bool, _Row]  # child, parent, whether it holds at all times
 
 
 def rosbag_stream(
@@ -102,10 +103,12 @@ def rosbag_stream(
             times, transforms, odometry, first = _scan(reader, clouds)
         if first is None:
             raise ValueError(f"{path}: topic {clouds[0].topic!r} has no message, expected clouds")
-        sensor = _name(first.header.frame_id)
+        sensor = frame_name(first.header.frame_id)
         edges, above = {}, [sensor]  # without poses nothing is above the sensor
         if poses:
-            edges, above = _tree(path, transforms, odometry, sensor, odometry_topic, world_frame)
+            edges, above = find_tree(
+                path, transforms, odometry, sensor, odometry_topic, world_frame
+            )
         kept_open = closing.pop_all()
 
     def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +124,7 @@ def rosbag_stream(
         return cloud, transform_up(edges, upward(message), _seconds(message.header.stamp))
 
     def upward(message: Any) -> list[str]:
-        own = _name(message.header.frame_id)
+        own = frame_name(message.header.frame_id)
         if own == sensor:
             return above
         if own not in edges or own == above[-1]:
@@ -129,7 +132,7 @@ def rosbag_stream(
                 f"{path}, {clouds[0].topic}: cloud in frame {own!r}, which has no transform up to "
                 f"the frame of the map, {above[-1]!r}"
             )
-        return _unique_path_up(edges, own, above[-1])
+        return unique_path_up(edges, own, above[-1])
 
     stream = FrameStream(path, len(times), frame, [stamp for _, _, stamp in times])
     weakref.finalize(stream, kept_open.close)
@@ -187,7 +190,7 @@ def _clouds(reader: AnyReader, path: Path, topic: str | None) -> list[Connection
 
 def _scan(
     reader: AnyReader, clouds: list[Connection]
-) -> tuple[list[tuple[int, int, float]], list[_Transform], dict[str, list[_Transform]], Any]:
+) -> tuple[list[tuple[int, int, float]], list[Transform], dict[str, list[Transform]], Any]:
     """Reads a bag once, one message at a time.
 
     Returns:
@@ -197,8 +200,8 @@ def _scan(
     """
     wanted = [c for c in reader.connections if c.msgtype in (*_TRANSFORMS, _ODOMETRY)]
     times: list[tuple[int, int, float]] = []
-    transforms: list[_Transform] = []
-    odometry: dict[str, list[_Transform]] = defaultdict(list)
+    transforms: list[Transform] = []
+    odometry: dict[str, list[Transform]] = defaultdict(list)
     first = None
     for connection, time, raw in reader.messages([*clouds, *wanted]):
         if connection.msgtype == _CLOUD:
@@ -211,166 +214,15 @@ def _scan(
         if connection.msgtype == _ODOMETRY:
             pose = message.pose.pose
             row = _seconds(message.header.stamp), pose.position, pose.orientation
-            names = _name(message.child_frame_id), _name(message.header.frame_id)
+            names = frame_name(message.child_frame_id), frame_name(message.header.frame_id)
             odometry[connection.topic].append((*names, False, row))
             continue
         fixed = connection.topic.endswith("tf_static")
         for each in message.transforms:
             row = _seconds(each.header.stamp), each.transform.translation, each.transform.rotation
-            names = _name(each.child_frame_id), _name(each.header.frame_id)
+            names = frame_name(each.child_frame_id), frame_name(each.header.frame_id)
             transforms.append((*names, fixed, row))
     return times, transforms, odometry, first
-
-
-def _edges(path: Path, transforms: Iterable[_Transform]) -> dict[str, Edge]:
-    """Groups transforms by child frame; motion takes precedence over a fixed transform."""
-    rows: dict[tuple[str, bool], list[_Row]] = defaultdict(list)
-    parents: dict[tuple[str, bool], str] = {}
-    for child, parent, fixed, row in transforms:
-        known = parents.setdefault((child, fixed), parent)
-        if known != parent:
-            raise ValueError(f"{path}: frame {child!r} has two parents, {known!r} and {parent!r}")
-        rows[child, fixed].append(row)
-    edges = {}
-    for (child, fixed), parent in sorted(parents.items(), key=lambda item: not item[0][1]):
-        table = rows[child, fixed]
-        motion = _timed(table[-1:] if fixed else table, f"{path}, {child} in {parent}")
-        edges[child] = Edge(parent, motion, fixed)
-    return edges
-
-
-def _timed(rows: list[_Row], source: str) -> TimedPoses:
-    """Sorts poses by time."""
-    rows = sorted(rows, key=lambda row: row[0])
-    return TimedPoses(
-        stamps=np.array([stamp for stamp, _, _ in rows]),
-        positions=np.array([(p.x, p.y, p.z) for _, p, _ in rows]),
-        quaternions=np.array([(q.x, q.y, q.z, q.w) for _, _, q in rows]),
-        source=source,
-    )
-
-
-def _tree(
-    path: Path,
-    transforms: list[_Transform],
-    odometry: dict[str, list[_Transform]],
-    sensor: str,
-    odometry_topic: str | None,
-    world_frame: str | None,
-) -> tuple[dict[str, Edge], list[str]]:
-    """Returns the tree of frames, and the path in it from the sensor up to the map."""
-    if world_frame is not None and not isinstance(world_frame, str):
-        raise ValueError(f"{path}: world_frame is {world_frame!r}, expected a frame's name")
-    world_frame = None if world_frame is None else _name(world_frame)
-    edges = _edges(path, transforms)
-    if odometry_topic is None:
-        odometry_topic = _default_odometry(path, edges, odometry, sensor, world_frame)
-    if odometry_topic is not None:
-        edges |= _odometry_edges(path, edges, odometry, sensor, odometry_topic)
-    to_root = path_up(edges, sensor)
-    if world_frame is not None:
-        _check_world_frame(path, edges, to_root, world_frame)
-    elif odometry_topic is None and not moving(edges, to_root):  # odometry may well stand still
-        raise NoPosesError(
-            f"{path}: nothing moves above the cloud's frame, {' in '.join(to_root)}; expected tf, "
-            f"or one of the odometry topics {sorted(odometry)} whose child is one of these frames, "
-            "or a world_frame if the sensor stands still"
-        )
-    return edges, _unique_path_up(edges, sensor, world_frame)
-
-
-def _odometry_edges(
-    path: Path,
-    edges: dict[str, Edge],
-    odometry: dict[str, list[_Transform]],
-    sensor: str,
-    topic: str,
-) -> dict[str, Edge]:
-    """Returns the edges of an odometry topic, one of them above the sensor."""
-    if topic not in odometry:
-        raise ValueError(f"{path}: odometry_topic = {topic!r}, expected one of {sorted(odometry)}")
-    moved = _edges(path, odometry[topic])
-    above = path_up(edges | moved, sensor)
-    if moved.keys().isdisjoint(above):
-        raise NoPosesError(
-            f"{path}: odometry topic {topic} moves {list(moved)}, expected one of {above}, the "
-            "frames from the cloud's frame upward"
-        )
-    return moved
-
-
-def _check_world_frame(
-    path: Path, edges: dict[str, Edge], to_root: list[str], world_frame: str
-) -> None:
-    """Raises unless a frame can be that of the map, for a sensor with this path to the root."""
-    if world_frame not in to_root:
-        raise ValueError(
-            f"{path}: frame {world_frame!r} is not above {to_root[0]!r}, expected one of "
-            f"{to_root[1:]}"
-        )
-    if world_frame == to_root[0] and moving(edges, to_root):
-        raise ValueError(
-            f"{path}: world_frame = {world_frame!r}, which is the clouds' own and moves; expected "
-            f"one of {to_root[1:]}"
-        )
-
-
-def _unique_path_up(edges: dict[str, Edge], frame: str, top: str | None) -> list[str]:
-    """Calls `path_up`, and checks that no edge on the path has two poses at one time."""
-    path = path_up(edges, frame, top)
-    for child in path[:-1]:
-        if not edges[child].fixed:
-            check_unique(edges[child].motion)
-    return path
-
-
-def _default_odometry(
-    path: Path,
-    edges: dict[str, Edge],
-    odometry: dict[str, list[_Transform]],
-    sensor: str,
-    world_frame: str | None,
-) -> str | None:
-    """Returns the odometry topic that has the motion of the sensor, None if tf has it."""
-    joints = moving(edges, path_up(edges, sensor))
-    if not joints:
-        return next(iter(odometry)) if len(odometry) == 1 else None
-    rivals = [
-        topic
-        for topic, rows in odometry.items()
-        if moves(_timed([row for *_, row in rows], f"{path}, {topic}"))
-    ]
-    known = [_tf_has(edges, sensor, *odometry[topic][0][:2]) for topic in rivals]
-    if not rivals or True in known:
-        return None
-    if known == [False]:
-        return rivals[0]
-    if world_frame is not None:
-        return None
-    raise ValueError(
-        f"{path}: tf moves {joints}, and odometry topics {rivals} move "
-        f"{[odometry[topic][0][0] for topic in rivals]}; expected odometry_topic= or world_frame= "
-        "to choose odometry or tf as the motion of the sensor"
-    )
-
-
-def _tf_has(edges: dict[str, Edge], sensor: str, child: str, parent: str) -> bool | None:
-    """Returns whether tf has the motion of an odometry's child in its parent; None if unknown.
-
-    What moves between the sensor and the child is a joint, such as that of a turning mount.
-    """
-    above, over_child = path_up(edges, sensor), path_up(edges, child)
-    if child in above:
-        return bool(moving(edges, over_child))
-    if over_child[-1] == above[-1]:
-        return True if moving(edges, over_child) else None
-    if parent in above:
-        return bool(moving(edges, path_up(edges, sensor, parent)))
-    return None
-
-
-def _name(frame: str) -> str:
-    return frame.lstrip("/")  # old tf wrote names with a leading slash
 
 
 def _stamp_of(raw: bytes, is_ros2: bool) -> float:
