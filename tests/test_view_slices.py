@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib import colormaps
 from matplotlib.image import imread
 
@@ -108,3 +109,24 @@ def test_messages_name_the_wrong_argument(tmp_path):
         save_slices(tmp_path / "a.png", disk, None, BOUNDS[::-1], [0.5])
     with pytest.raises(ValueError, match=r"sdf has shape \(16384, 3\)"):
         save_slices(tmp_path / "a.png", lambda p: p, None, BOUNDS, [0.5])
+
+
+def test_the_surface_of_a_mesh_is_drawn_where_it_is_cut(tmp_path):
+    cube = trimesh.creation.box((1.0, 0.8, 1.0))
+    lines = np.stack(slices._section(cube, 0.3).get_segments())
+    on_x, on_y = (
+        np.isclose(np.abs(lines[..., axis]), half).all(axis=1)
+        for axis, half in ((0, 0.5), (1, 0.4))
+    )
+    assert (on_x | on_y).all()
+    assert np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum() == pytest.approx(3.6)
+    assert not slices._section(cube, 0.7).get_segments()
+
+    def far(points):
+        return np.full(len(points), 5.0)
+
+    drawn = {}
+    for name, mesh in (("without", None), ("with", cube)):
+        save_slices(tmp_path / f"{name}.png", far, None, BOUNDS, [0.3], mesh=mesh)
+        drawn[name] = imread(tmp_path / f"{name}.png")[..., :3].max(axis=-1) < 0.3
+    assert drawn["with"].sum() > drawn["without"].sum() + 100

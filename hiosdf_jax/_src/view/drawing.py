@@ -116,7 +116,15 @@ def _draw_slices(
         slice_heights(float(np.median(path[:, 2])), float(low), float(high)),
         path_world=path,
         observed=lambda points: queries.observed(points @ turn),
+        mesh=_turned(surface, rotation),
     )
+
+
+def _turned(surface: trimesh.Trimesh, rotation: np.ndarray) -> trimesh.Trimesh:
+    """Turns a mesh into the frame of points @ rotation."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.T
+    return surface.copy().apply_transform(matrix)
 
 
 def _write_mesh(folder: Path, surface: trimesh.Trimesh, up_world: np.ndarray) -> None:

@@ -6,12 +6,17 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.output_files import replacing
+
+if TYPE_CHECKING:
+    import trimesh
+    from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
 
 _COLUMNS = 400  # samples along the longer side of a slice
 CHUNK = 16384  # points per query; one shape, so that a jitted map compiles once
@@ -28,6 +33,7 @@ def save_slices(
     heights: Sequence[float],
     path_world: np.ndarray | None = None,
     observed: Callable[[np.ndarray], Any] | None = None,
+    mesh: trimesh.Trimesh | None = None,
 ) -> None:
     """Draws slices of a map at constant z, one row per height (as in Fig. 4 of the paper).
 
@@ -48,16 +54,16 @@ def save_slices(
         heights: z of each slice, m, world frame.
         path_world: (F, 3) m, the path of the sensor, drawn on top.
         observed: Maps (n, 3) points to (n,) bool.
+        mesh: The surface of the map, m, world frame. By default the zero level of `sdf` is drawn,
+            which closes around both sides of a thin wall.
 
     Raises:
         ValueError: There are no heights, bounds is not (2, 3) with a positive size in x and y, or a
             callable returned the wrong shape.
         OSError: The picture cannot be written.
     """
-    from matplotlib.figure import (
-        Figure,
-    )  # not pyplot: draws with Agg, whatever backend the user has
-    from scipy.ndimage import maximum_filter
+    # Not pyplot: this draws with Agg, whatever backend the user has.
+    from matplotlib.figure import Figure
 
     box = np.asarray(bounds, float)
     if box.shape != (2, 3) or not (box[1, :2] > box[0, :2]).all():
@@ -95,16 +101,10 @@ def save_slices(
             ax.imshow(panel, **image, **(error if i == 2 else distance))
             if seen is not None:
                 ax.imshow(np.where(seen, np.nan, 0.78), **image, cmap="gray", vmin=0, vmax=1)
-            surface = panels[min(i, 1)]  # the error's panel shows the true surfaces
-            # An unsigned distance never crosses zero: a level close to it replaces zero.
-            level = 0.0 if np.nanmin(surface) < 0 else x[1] - x[0]
-            if i == 0 and seen is not None:
-                # Zeros far from observed space are guesses of the map, not surfaces.
-                samples = math.ceil(_SURFACE_REACH / (x[1] - x[0]))
-                surface = np.where(maximum_filter(seen, 2 * samples + 1), surface, np.nan)
-            finite = surface[np.isfinite(surface)]
-            if finite.size and finite.min() < level < finite.max():
-                ax.contour(x, y, surface, levels=[level], colors="black", linewidths=1.0)
+            if i == 0 and mesh is not None:
+                ax.add_collection(_section(mesh, height))
+            else:  # the error's panel shows the true surfaces
+                _draw_zeros(ax, x, y, panels[min(i, 1)], seen if i == 0 else None)
             if path_world is not None:
                 path_xy = np.asarray(path_world, float)[:, :2]
                 ax.plot(*path_xy.T, color="tab:green", linewidth=1.2)
@@ -126,6 +126,32 @@ def save_slices(
     figure.supxlabel("; ".join(notes), fontsize=9)
     with replacing(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=110)
+
+
+def _section(mesh: trimesh.Trimesh, height: float) -> LineCollection:
+    """Cuts a mesh at a height, m."""
+    from matplotlib.collections import LineCollection
+    from trimesh.intersections import mesh_plane
+
+    lines = mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, height])
+    return LineCollection([line[:, :2] for line in lines], colors="black", linewidths=1.0)
+
+
+def _draw_zeros(
+    ax: Axes, x: np.ndarray, y: np.ndarray, distances: np.ndarray, seen: np.ndarray | None
+) -> None:
+    """Draws where distances are zero, in space that was seen or near it."""
+    from scipy.ndimage import maximum_filter
+
+    # An unsigned distance never crosses zero: a level close to it replaces zero.
+    level = 0.0 if np.nanmin(distances) < 0 else x[1] - x[0]
+    if seen is not None:
+        # Zeros far from observed space are guesses of the map, not surfaces.
+        samples = math.ceil(_SURFACE_REACH / (x[1] - x[0]))
+        distances = np.where(maximum_filter(seen, 2 * samples + 1), distances, np.nan)
+    finite = distances[np.isfinite(distances)]
+    if finite.size and finite.min() < level < finite.max():
+        ax.contour(x, y, distances, levels=[level], colors="black", linewidths=1.0)
 
 
 def _axes(box: np.ndarray) -> list[np.ndarray]:
