@@ -114,15 +114,19 @@ def median_ms(function, arguments):
     return 1e3 * np.median(seconds)
 
 
-def print_hypotheses(field, cloud, pose, count):
-    """Times one refinement inside `jit`, and many poses at once by few returns."""
+def print_hypotheses(field, frames, count):
+    """Times refinements inside `jit`, and many poses of one frame at once by few returns."""
     rng = np.random.default_rng(0)
     distance_m, angle_deg = CASES[1]
+    refine = jax.jit(hio.refine_pose)
+    times = []
+    for cloud, pose in frames:
+        whole = jax.device_put(np.asarray(cloud, np.float32))
+        times.append(median_ms(refine, (field, whole, perturb(pose, rng, distance_m, angle_deg))))
+    print(f"one pose inside jit, median of {len(frames)} frames: {np.median(times):.2f} ms")
+    cloud, pose = frames[0]
     starts = np.stack([perturb(pose, rng, distance_m, angle_deg) for _ in range(count)])
-    whole = jax.device_put(np.asarray(cloud, np.float32))
-    one = median_ms(jax.jit(hio.refine_pose), (field, whole, starts[0]))
-    print(f"one pose inside jit, {len(cloud)} points: {one:.2f} ms")
-    returns = whole[np.isfinite(cloud).all(axis=1)]
+    returns = np.asarray(cloud, np.float32)[np.isfinite(cloud).all(axis=1)]
     few = returns[np.linspace(0, len(returns) - 1, POINTS_OF_HYPOTHESES).astype(int)]
     for most in (1, 5):
         refine = jax.vmap(partial(hio.refine_pose, starts=most), (None, None, 0))
@@ -172,7 +176,7 @@ def main():
         found = hio.refine_pose(field, cloud, frames[0][1])
         print(f"{name}: converged {bool(found.converged)}, inliers {float(found.inliers):.2f}")
     if arguments.hypotheses:
-        print_hypotheses(field, *frames[0], arguments.hypotheses)
+        print_hypotheses(field, frames, arguments.hypotheses)
 
 
 if __name__ == "__main__":
