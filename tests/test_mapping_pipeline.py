@@ -288,7 +288,7 @@ def test_flags_are_made_of_the_array_in_a_report(kind, bits):
     assert hio.Flag(kind(bits)) is hio.Flag(bits)
 
 
-@pytest.mark.parametrize("value", [2.5, np.float32(3), "2", None])
+@pytest.mark.parametrize("value", [2.5, np.float32(2.5), "2", None])
 def test_flags_of_no_integer_are_refused(value):
     with pytest.raises(ValueError, match=r"flags is .*, expected an integer, as in a report"):
         hio.Flag(value)
