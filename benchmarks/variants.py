@@ -10,7 +10,7 @@ import hiosdf_jax as hio
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state.pytrees import Field
 
 
 def _grid(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -36,7 +36,8 @@ from hiosdf_jax._src.mapping.registration.refining import Registration, refine_p
 from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize
 from hiosdf_jax._src.mapping.registration.smoothing import smooth_poses
 from hiosdf_jax._src.mapping.tracking import predict_pose, track
-from hiosdf_jax._src.state import Baked, Field, Flag, MapState, Query, Report
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import Baked, Field, MapState, Query, Report
 from hiosdf_jax._src.view.live import Viewer, view
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.state import Baked
+from hiosdf_jax._src.state.pytrees import Baked
 
 
 def baked(exact_sdf, low, high, resolution, frontier=None):

@@ -22,7 +22,7 @@ from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.grid.lookup import grid_sdf
 from hiosdf_jax._src.scoring import held_out, surface
-from hiosdf_jax._src.state import surface_of
+from hiosdf_jax._src.state.pytrees import surface_of
 
 FRAMES = 8
 RAYS = 900  # per frame; the truth has as many points, so that one shape is compiled

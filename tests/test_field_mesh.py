@@ -13,7 +13,7 @@ from room import HALF
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import polygons
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.state import NO_FEATURE
+from hiosdf_jax._src.state.pytrees import NO_FEATURE
 
 VOXEL = 0.1
 BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

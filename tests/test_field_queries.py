@@ -11,7 +11,7 @@ from room import BOUNDS, CONFIG, ask
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid import lookup
-from hiosdf_jax._src.state import FRONTIER_STEPS, surface_of
+from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, surface_of
 
 network_sdf = jax.jit(blend.network_sdf)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hiosdf_jax._src.grid import distance
-from hiosdf_jax._src.state import Side
+from hiosdf_jax._src.state.pytrees import Side
 
 # The center of the one voxel lies half a voxel in front of a plane, or behind it.
 SIGNS = {

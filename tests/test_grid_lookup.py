@@ -25,7 +25,7 @@ from voxels import (
 from hiosdf_jax._src.grid import evidence, lookup, patches
 from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.vectors import split
-from hiosdf_jax._src.state import NO_FEATURE, Side, surface_of
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side, surface_of
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from room import BOUNDS, CONFIG, arrays_equal, ask, stream
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid.evidence import empty_grid
-from hiosdf_jax._src.state import NO_FEATURE
+from hiosdf_jax._src.state.pytrees import NO_FEATURE
 
 BOX = ((0.6, -0.5, -0.5), (2.0, 0.5, 0.5))  # a part of a wall, and beyond the bounds
 

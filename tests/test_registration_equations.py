@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.registration import comparing, equations, solving
 from hiosdf_jax._src.mapping.registration.comparing import compare, make_rows
-from hiosdf_jax._src.state import field_of
+from hiosdf_jax._src.state.pytrees import field_of
 
 COUNT = 1000
 SHEET_CONFIG = dataclasses.replace(CONFIG, max_points=COUNT)

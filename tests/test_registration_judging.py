@@ -9,7 +9,7 @@ from room import HALF, room_cloud
 from hiosdf_jax._src.mapping.registration.comparing import make_rows
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
-from hiosdf_jax._src.state import field_of
+from hiosdf_jax._src.state.pytrees import field_of
 
 COUNT = 1000
 

@@ -8,7 +8,7 @@ from voxels import CONFIG, SHAPE, grid_of_room
 from hiosdf_jax._src.grid import evidence, geometry, lookup
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.samples.from_grid import sample_grid
-from hiosdf_jax._src.state import surface_of
+from hiosdf_jax._src.state.pytrees import surface_of
 
 
 def test_samples_are_near_and_far_and_have_the_grids_distance():

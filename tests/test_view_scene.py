@@ -7,7 +7,7 @@ from room import BOUNDS, CONFIG, HALF, room_cloud, room_sdf
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.state import Side
+from hiosdf_jax._src.state.pytrees import Side
 from hiosdf_jax._src.view import colors, moments, scene
 
 

@@ -14,7 +14,7 @@ from hiosdf_jax._src.grid.evidence import EvidenceWindow
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.grid.windows import RayBox
 from hiosdf_jax._src.numerics.gradient import value_and_gradient
-from hiosdf_jax._src.state import Evidence, Grid
+from hiosdf_jax._src.state.pytrees import Evidence, Grid
 
 BOUNDS = ((-0.3, 0.0, 0.2), (0.9, 1.0, 1.0))
 CONFIG = hio.Config.light(

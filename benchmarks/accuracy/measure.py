@@ -20,7 +20,7 @@ from benchmarks.accuracy.sources import Source
 from benchmarks.variants import VARIANTS
 from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field.compiled import CompiledQueries
-from hiosdf_jax._src.state import Field, field_of
+from hiosdf_jax._src.state.pytrees import Field, field_of
 
 # Forgetting compares the error in the region of the first frames, right after them and at the end.
 EARLY_FRAMES = 20

@@ -13,7 +13,7 @@ from benchmarks.speed.rows import Baseline, Spread, time_ms
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.network import forward
 from hiosdf_jax._src.samples.draw import Samples
-from hiosdf_jax._src.state import Network
+from hiosdf_jax._src.state.pytrees import Network
 
 
 def training(config: Config, network: Network, samples: Samples, seconds: float) -> list[Baseline]:

@@ -16,7 +16,7 @@ from hiosdf_jax._src.command.timing import points_in
 from hiosdf_jax._src.config import Bounds
 from hiosdf_jax._src.network import training
 from hiosdf_jax._src.samples.draw import Samples
-from hiosdf_jax._src.state import field_of
+from hiosdf_jax._src.state.pytrees import field_of
 
 
 def train(label: str, config: hio.Config, machine: limits.Limits, seconds: float) -> Measured:

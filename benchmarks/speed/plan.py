@@ -9,7 +9,7 @@ import hiosdf_jax as hio
 from benchmarks.speed import fleets, limits, networks, processes, queries, scaling, stages, updates
 from benchmarks.speed.rows import Measured
 from benchmarks.speed.setup import Setup
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 Task = Callable[[], Measured]
 

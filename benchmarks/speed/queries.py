@@ -14,7 +14,7 @@ from benchmarks.speed.rows import Baseline, Measured, Row, Spread, time_ms
 from benchmarks.speed.setup import Sizes
 from benchmarks.variants import VARIANTS
 from hiosdf_jax._src.command.timing import points_in
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 
 def query_map(label: str, state: MapState, machine: limits.Limits, sizes: Sizes) -> Measured:

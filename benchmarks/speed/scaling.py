@@ -16,7 +16,7 @@ import hiosdf_jax as hio
 from benchmarks.speed.rows import OUT_OF_TIME, Baseline, Measured, Row, time_ms
 from benchmarks.speed.setup import Setup
 from benchmarks.speed.updates import map_frames
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 
 def compile_updates(setup: Setup, donated: str) -> Measured:

@@ -19,7 +19,7 @@ from hiosdf_jax._src.grid import evidence, geometry, patches
 from hiosdf_jax._src.grid.windows import RayBox, Window, box_of_rays, place_windows
 from hiosdf_jax._src.mapping import pipeline
 from hiosdf_jax._src.mapping.stages import STAGES, Step, begin
-from hiosdf_jax._src.state import Evidence, MapState
+from hiosdf_jax._src.state.pytrees import Evidence, MapState
 
 _COMPARE = {
     "update_distances": "distance",

@@ -15,7 +15,7 @@ from benchmarks.speed.processes import resident_mb
 from benchmarks.speed.rows import Baseline, Measured, Row, single, spread_of, time_ms
 from benchmarks.speed.setup import Setup
 from hiosdf_jax._src.mapping import pipeline
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 _TURNS = 5
 

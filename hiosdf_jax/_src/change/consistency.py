@@ -15,7 +15,7 @@ from hiosdf_jax._src.change.piercing import find_piercing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.modes import run_if
-from hiosdf_jax._src.state import Grid
+from hiosdf_jax._src.state.pytrees import Grid
 
 CONFIDENT_UPDATES = 5
 """The map can judge a cloud after this many updates."""

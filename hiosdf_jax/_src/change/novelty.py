@@ -17,7 +17,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.vectors import split
-from hiosdf_jax._src.state import Grid
+from hiosdf_jax._src.state.pytrees import Grid
 
 # A novel return is this far from every surface, beside three standard deviations of its range.
 _NOVEL_VOXELS = 1.5

@@ -11,7 +11,7 @@ from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import split
-from hiosdf_jax._src.state import Grid
+from hiosdf_jax._src.state.pytrees import Grid
 
 # A ray has pierced a surface where a voxel's center is this far behind it. Its end may lie this far
 # behind the surface, beside three standard deviations of its range.

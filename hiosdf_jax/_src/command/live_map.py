@@ -14,7 +14,7 @@ from hiosdf_jax._src.command.map_frames import up_of_frame
 from hiosdf_jax._src.command.progress import Progress
 from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax._src.mapping.lifecycle import snapshot
-from hiosdf_jax._src.state import Field, MapState
+from hiosdf_jax._src.state.pytrees import Field, MapState
 from hiosdf_jax._src.view.live import Viewer
 
 _SHARE = 0.08  # of the time of the mapping, that drawing may take

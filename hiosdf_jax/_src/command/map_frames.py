@@ -18,7 +18,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.scoring.held_out import draw_returns
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 
 class NothingMappedError(Exception):

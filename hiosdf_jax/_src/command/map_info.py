@@ -11,7 +11,8 @@ import numpy as np
 
 from hiosdf_jax._src.command.report import FLAG_WORDS
 from hiosdf_jax._src.mapping import checkpoint
-from hiosdf_jax._src.state import Flag, MapState, field_of
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import MapState, field_of
 
 _PRESETS = ("light", "default", "paper")
 

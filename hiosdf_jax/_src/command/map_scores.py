@@ -10,7 +10,7 @@ from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.mapping import checkpoint
 from hiosdf_jax._src.mapping.lifecycle import snapshot
 from hiosdf_jax._src.scoring import metrics
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 
 def score_map(

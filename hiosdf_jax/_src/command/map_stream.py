@@ -25,7 +25,7 @@ from hiosdf_jax._src.field.mesh import extract_mesh
 from hiosdf_jax._src.mapping import checkpoint, lifecycle
 from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring import held_out, metrics
-from hiosdf_jax._src.state import MapState, field_of
+from hiosdf_jax._src.state.pytrees import MapState, field_of
 from hiosdf_jax._src.view import drawing
 from hiosdf_jax._src.view.growing import Stage, save_growing
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hiosdf_jax._src.mapping import checkpoint
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 
 class Progress(NamedTuple):

@@ -15,7 +15,7 @@ from hiosdf_jax._src.command.map_frames import Mapped
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.output_files import replacing
 from hiosdf_jax._src.scoring import table
-from hiosdf_jax._src.state import Flag
+from hiosdf_jax._src.state.flags import Flag
 
 FLAG_WORDS = {
     Flag.BAD_POSE: "a pose was not finite or not rigid",

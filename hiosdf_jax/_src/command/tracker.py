@@ -19,7 +19,7 @@ from hiosdf_jax._src.mapping.tracking import (
     track,
 )
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 from hiosdf_jax._src.view.paths import save_paths
 
 TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")

@@ -26,7 +26,7 @@ from hiosdf_jax._src.demo.sensing import (
     scan_from_above,
 )
 from hiosdf_jax._src.mapping import lifecycle, pipeline
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state.pytrees import Field
 
 # A body 0.4 m wide, from 0.15 m to 1.25 m above the floor.
 ROBOT = Robot(heights=(0.35, 0.49, 0.63, 0.77, 0.91, 1.05))

@@ -10,7 +10,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.demo.apartment import BOUNDS_WORLD
 from hiosdf_jax._src.demo.camera import DepthCamera
 from hiosdf_jax._src.mapping import pipeline
-from hiosdf_jax._src.state import MapState
+from hiosdf_jax._src.state.pytrees import MapState
 
 # The camera looks over the floor ahead, in portrait format.
 CAMERA_HEIGHT = 1.1  # m

@@ -16,7 +16,8 @@ from hiosdf_jax._src.numerics.arrays import on_device, scalar
 from hiosdf_jax._src.numerics.intake import as_real, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
-from hiosdf_jax._src.state import Baked, Field, MapState, as_live_field
+from hiosdf_jax._src.state.checks import as_live_field
+from hiosdf_jax._src.state.pytrees import Baked, Field, MapState
 
 _CHUNK = 65536  # samples at a time: activations are many times larger than a sample
 

@@ -16,7 +16,7 @@ from hiosdf_jax._src.config import Bounds, Config
 from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.network import siren
 from hiosdf_jax._src.numerics.barriers import compute_once
-from hiosdf_jax._src.state import Field, Unknown
+from hiosdf_jax._src.state.pytrees import Field, Unknown
 
 # The grid's answer fades out between these shares of its horizon.
 _FADE = (0.8, 1.0)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from hiosdf_jax._src.field import queries
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state.pytrees import Field
 
 
 @dataclasses.dataclass(frozen=True)

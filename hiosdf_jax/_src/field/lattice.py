@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.numerics.intake import as_number
-from hiosdf_jax._src.state import Baked, Unknown
+from hiosdf_jax._src.state.pytrees import Baked, Unknown
 
 _MOST_SAMPLES = 2**31 - 1
 

@@ -14,7 +14,8 @@ from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.state import Field, MapState, as_live_field
+from hiosdf_jax._src.state.checks import as_live_field
+from hiosdf_jax._src.state.pytrees import Field, MapState
 
 if TYPE_CHECKING:
     import trimesh

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.state import NO_FEATURE, Surface
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Surface
 
 # A polygon covers this many standard deviations of the hits to each side, along each axis of the
 # grid. Hits that cover a rectangle evenly reach 1.7; more draws surfaces beyond edges.

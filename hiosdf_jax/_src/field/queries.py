@@ -16,16 +16,8 @@ from hiosdf_jax._src.numerics.gradient import value_and_gradient
 from hiosdf_jax._src.numerics.intake import check_vectors
 from hiosdf_jax._src.numerics.modes import pointwise
 from hiosdf_jax._src.numerics.point_tiles import Evaluate, by_rows
-from hiosdf_jax._src.state import (
-    Baked,
-    Bound,
-    Field,
-    MapState,
-    Query,
-    Unknown,
-    check_single,
-    field_of,
-)
+from hiosdf_jax._src.state.checks import check_single
+from hiosdf_jax._src.state.pytrees import Baked, Bound, Field, MapState, Query, Unknown, field_of
 
 _FAR = 1e30  # m
 

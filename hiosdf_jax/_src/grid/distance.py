@@ -12,7 +12,7 @@ from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
-from hiosdf_jax._src.state import NO_FEATURE, Derived, Grid, Side
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Derived, Grid, Side
 
 # A voxel is free with at least this many passes per ray that ended just before it: noise puts some
 # ends of rays too far away.

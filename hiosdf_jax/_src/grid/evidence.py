@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS, Rays
-from hiosdf_jax._src.state import FRONTIER_STEPS, NO_FEATURE, Derived, Evidence, Grid, Side
+from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, NO_FEATURE, Derived, Evidence, Grid, Side
 
 # Half the memory of float32, and finer than the noise.
 _STORED = jnp.float16

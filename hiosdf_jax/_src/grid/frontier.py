@@ -13,7 +13,7 @@ from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
-from hiosdf_jax._src.state import FRONTIER_STEPS, Grid, frontier_step_m
+from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, Grid, frontier_step_m
 
 _INFINITE = 1e12  # squared voxels
 

@@ -27,7 +27,7 @@ from hiosdf_jax._src.numerics.vectors import (
     take,
     unit,
 )
-from hiosdf_jax._src.state import NO_FEATURE, Derived, Side, Surface, frontier_step_m
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Derived, Side, Surface, frontier_step_m
 
 # A patch's weight falls by 1 / e for each of these distances that it is farther than the nearest
 # one, voxels. Twice as much rounds off corners: 0.25 instead of 0.18 cm in a small room. Half as

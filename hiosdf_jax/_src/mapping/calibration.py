@@ -15,7 +15,7 @@ from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.masks import running_sum
 from hiosdf_jax._src.samples.draw import draw_from_mask, draw_words
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state.pytrees import Field
 
 # Points on surfaces are the hardest: a bound that holds for 94.5 % of the surface holds for 99 % of
 # the points of free space.

@@ -19,7 +19,8 @@ from hiosdf_jax._src.mapping.lifecycle import init
 from hiosdf_jax._src.mapping.stored_values import check_array, check_grid
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import Grid, MapState, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.pytrees import Grid, MapState
 
 _FORMAT = "hiosdf_jax map"
 _VERSION = 4

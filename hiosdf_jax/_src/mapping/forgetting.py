@@ -17,7 +17,8 @@ from hiosdf_jax._src.numerics.intake import as_floats, is_traced
 from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.vectors import each
-from hiosdf_jax._src.state import Evidence, Grid, MapState, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.pytrees import Evidence, Grid, MapState
 
 
 def forget(state: MapState, box: Any) -> MapState:

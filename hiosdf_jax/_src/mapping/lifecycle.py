@@ -15,7 +15,8 @@ from hiosdf_jax._src.mapping.calibration import initial_optimism
 from hiosdf_jax._src.network.training import init_network
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import as_array, as_key, is_traced
-from hiosdf_jax._src.state import Field, MapState, Report, check_map, field_of
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.pytrees import Field, MapState, Report, field_of
 
 
 def init(config: Config, key: jax.Array) -> MapState:

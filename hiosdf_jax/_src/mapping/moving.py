@@ -12,7 +12,8 @@ from hiosdf_jax._src.mapping.stages import CHECKS, begin, run_stages
 from hiosdf_jax._src.numerics.intake import as_traced, check_pose, checked_cloud, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.state import MapState, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.pytrees import MapState
 
 
 def moving_rows(

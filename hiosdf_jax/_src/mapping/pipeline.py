@@ -30,7 +30,8 @@ from hiosdf_jax._src.numerics.intake import (
 )
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.state import MapState, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.pytrees import MapState
 
 _HASHED_EVERY = 64  # rows of a cloud per hashed row
 _SAMPLED_ROWS = 500  # of a cloud; all rows are counted where the sample is not clear

@@ -24,7 +24,8 @@ from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.numerics.robot_and_noise import extras_are_valid
 from hiosdf_jax._src.samples import from_cloud, from_grid
 from hiosdf_jax._src.samples.draw import Samples, concatenate
-from hiosdf_jax._src.state import Flag, Grid, MapState, Report, field_of
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import Grid, MapState, Report, field_of
 
 _LATER: Any = None  # a part that a later stage makes
 

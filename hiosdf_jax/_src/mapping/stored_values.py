@@ -9,7 +9,8 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
-from hiosdf_jax._src.state import FRONTIER_STEPS, NO_FEATURE, Flag, Grid, Side
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, NO_FEATURE, Grid, Side
 
 _Path = str | os.PathLike[str]
 

@@ -22,7 +22,9 @@ from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.state import Flag, MapState, Report, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import MapState, Report
 
 MOST_MOVED = 2.0
 """How far a pose may be moved from its prediction, as a share of `reach_m`, m and rad."""

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hiosdf_jax._src.state import Network
+from hiosdf_jax._src.state.pytrees import Network
 
 _FIRST = "Dense_0"
 

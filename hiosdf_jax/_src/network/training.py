@@ -17,7 +17,7 @@ from hiosdf_jax._src.network.loss import Losses
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.samples.draw import Samples
-from hiosdf_jax._src.state import Network
+from hiosdf_jax._src.state.pytrees import Network
 
 # Where at least this share of the surface is new or has vanished, the old weights are those of
 # another world: the average then keeps at most this share of them.

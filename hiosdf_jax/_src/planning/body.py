@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.planning.clearance import sphere_clearance_and_grad
-from hiosdf_jax._src.state import Bound
+from hiosdf_jax._src.state.pytrees import Bound
 
 BodySpheres = Callable[[jax.Array], tuple[jax.Array, Any]]
 """Configuration (n,) -> the body's spheres: centers_world (S, 3) m and radii (S,) m."""

@@ -12,7 +12,7 @@ from hiosdf_jax._src.field.queries import AnyField, Unknown, distance, distance_
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import check_vectors, is_traced
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.state import Bound
+from hiosdf_jax._src.state.pytrees import Bound
 
 _FAR = 1e30  # m
 

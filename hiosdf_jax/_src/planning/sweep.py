@@ -20,7 +20,7 @@ from hiosdf_jax._src.numerics.intake import as_number, check_whole, is_traced
 from hiosdf_jax._src.numerics.modes import plain, pointwise, varying_like
 from hiosdf_jax._src.numerics.vectors import length, split
 from hiosdf_jax._src.planning.clearance import checked_spheres
-from hiosdf_jax._src.state import Baked, Bound, Field
+from hiosdf_jax._src.state.pytrees import Baked, Bound, Field
 
 # m; farther points are clipped, so that the square of a length does not overflow.
 _FAR = 1e18

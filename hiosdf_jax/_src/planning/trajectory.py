@@ -14,7 +14,7 @@ from hiosdf_jax._src.numerics.gradient import least
 from hiosdf_jax._src.numerics.intake import as_key, as_number, check_whole, is_traced
 from hiosdf_jax._src.numerics.modes import plain, varying_like
 from hiosdf_jax._src.numerics.vectors import length, split
-from hiosdf_jax._src.state import Bound
+from hiosdf_jax._src.state.pytrees import Bound
 
 # Samples per segment that are held off the map; the last one is the segment's end.
 _SAMPLES_PER_SEGMENT = 4

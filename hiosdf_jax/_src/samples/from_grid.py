@@ -14,7 +14,7 @@ from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.samples.draw import Samples, draw_from_masks, draw_words, normal, uniform
-from hiosdf_jax._src.state import NO_FEATURE, Grid, surface_of
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Grid, surface_of
 
 # Far samples around changes, where the network is most wrong: their number per changed voxel, their
 # largest share of all far samples, and their standard deviation from the voxel.

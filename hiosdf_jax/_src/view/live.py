@@ -15,7 +15,8 @@ import numpy as np
 from hiosdf_jax._src.mapping.checkpoint import save
 from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.planning.clearance import checked_spheres
-from hiosdf_jax._src.state import Field, MapState, as_live_field
+from hiosdf_jax._src.state.checks import as_live_field
+from hiosdf_jax._src.state.pytrees import Field, MapState
 from hiosdf_jax._src.view import colors, moments, page, scene, serving, stage
 
 _UP = (0.0, 0.0, 1.0)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state.pytrees import Field
 from hiosdf_jax._src.view import scene
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
-from hiosdf_jax._src.state import Field, Side
+from hiosdf_jax._src.state.pytrees import Field, Side
 from hiosdf_jax._src.view import colors
 from hiosdf_jax._src.view.shading import remains_of_ceiling
 from hiosdf_jax._src.view.slices import CHUNK

@@ -12,7 +12,8 @@ from hiosdf_jax._src.mapping.pipeline import update
 from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.intake import as_floats
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.state import Baked, Field, Flag, MapState, field_of
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import Baked, Field, MapState, field_of
 
 type Serve = Callable[[Field], Field | Baked] | None
 """What makes the field that controllers read of each snapshot; None for the snapshot itself."""

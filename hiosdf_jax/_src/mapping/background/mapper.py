@@ -20,7 +20,8 @@ from hiosdf_jax._src.mapping.background.fusing import (
     checked,
     publish,
 )
-from hiosdf_jax._src.state import MapState, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.pytrees import MapState
 
 # From here on float32, which holds a field's stamp, rounds by more than 0.06 s.
 _MOST_SECONDS = 2.0**20

@@ -23,7 +23,9 @@ from hiosdf_jax._src.numerics.intake import as_array, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain, varying_like
 from hiosdf_jax._src.numerics.rigid import is_rigid, nearest_rotation
 from hiosdf_jax._src.samples.from_grid import sample_grid
-from hiosdf_jax._src.state import Flag, Grid, MapState, Network, check_map
+from hiosdf_jax._src.state.checks import check_map
+from hiosdf_jax._src.state.flags import Flag
+from hiosdf_jax._src.state.pytrees import Grid, MapState, Network
 
 # What the arrays of a map depend on. Maps in which these differ do not add up.
 _SHARED = ("voxel_size", "range_noise", "hidden_width", "hidden_layers", "frequency")

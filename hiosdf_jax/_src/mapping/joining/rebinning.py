@@ -18,7 +18,7 @@ from hiosdf_jax._src.grid.evidence import EvidenceWindow, fade_evidence
 from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import Vector, each, join, length, split
-from hiosdf_jax._src.state import Evidence
+from hiosdf_jax._src.state.pytrees import Evidence
 
 # A patch stays in its voxel if rounding has put its mean on the border: offsets count this much.
 _INNER = 0.999

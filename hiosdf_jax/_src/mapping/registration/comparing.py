@@ -27,7 +27,7 @@ from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.point_kernel import by_points, columns, joined, sum_by_points
 from hiosdf_jax._src.numerics.vectors import Vector, cross, dot, each
-from hiosdf_jax._src.state import Baked, Field, Surface
+from hiosdf_jax._src.state.pytrees import Baked, Field, Surface
 
 GROWING_REACH_M = 0.2
 """How far surfaces may be from where they should be, in a map that grows."""

@@ -32,7 +32,7 @@ from hiosdf_jax._src.numerics.small_matrices import (
     solve_entries,
     solve_positive,
 )
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.state.pytrees import Baked, Field
 
 # A direction is free if the returns fit about as well where they are moved this far along it, m: if
 # their mean loss, which is at most 1, grows by less than this. Its slope alone does not tell: noise

@@ -20,7 +20,7 @@ from hiosdf_jax._src.mapping.registration.comparing import (
 )
 from hiosdf_jax._src.mapping.registration.equations import LEAST_COMPARABLE
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.state.pytrees import Baked, Field
 
 LEAST_INLIERS = 0.7
 """Share of the returns in observed space that must lie on its surfaces."""

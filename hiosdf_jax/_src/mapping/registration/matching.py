@@ -15,7 +15,7 @@ from hiosdf_jax._src.field.queries import query
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.mapping.registration.motion import offsets_from
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, split
-from hiosdf_jax._src.state import Baked, Field, Surface
+from hiosdf_jax._src.state.pytrees import Baked, Field, Surface
 
 # A gradient that is shorter than this lies between surfaces and has no direction.
 _LEAST_SLOPE = 0.5

@@ -54,7 +54,7 @@ from hiosdf_jax._src.numerics.intake import (
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.rigid import is_rigid
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.state.pytrees import Baked, Field
 
 # Rows of a cloud from which the others are selected.
 _CANDIDATES = 16384

@@ -42,7 +42,7 @@ from hiosdf_jax._src.numerics.intake import (
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.small_matrices import product
 from hiosdf_jax._src.numerics.vectors import dot, each, split
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.state.pytrees import Baked, Field
 
 # A sensor is at least this far from surfaces, m.
 _CLEARANCE_M = 0.15

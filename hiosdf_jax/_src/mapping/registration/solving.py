@@ -45,7 +45,7 @@ from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.numerics.small_matrices import product
 from hiosdf_jax._src.numerics.tangents import all_zero, instantiate
-from hiosdf_jax._src.state import Baked, Field
+from hiosdf_jax._src.state.pytrees import Baked, Field
 
 # Surfaces may be this far from where they should be in the last coarse step, m. Fewer steps do not
 # suffice along directions in which few returns tell anything.

@@ -14,7 +14,7 @@ from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.intake import as_number, as_real
 from hiosdf_jax._src.planning.body import BodySpheres
 from hiosdf_jax._src.planning.clearance import checked_spheres, sphere_clearance
-from hiosdf_jax._src.state import Baked, Bound
+from hiosdf_jax._src.state.pytrees import Baked, Bound
 
 _PENALTY = 100.0
 _TOLERANCE = 1e-3

@@ -11,7 +11,7 @@ from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.gradient import least, value_and_gradient
 from hiosdf_jax._src.numerics.intake import as_array
 from hiosdf_jax._src.planning.clearance import sphere_clearance
-from hiosdf_jax._src.state import Bound
+from hiosdf_jax._src.state.pytrees import Bound
 
 if TYPE_CHECKING:
     from frax import Manipulator

@@ -16,7 +16,7 @@ from jaxls import Cost, Var  # pyright: ignore[reportMissingImports]
 from hiosdf_jax._src.field.queries import AnyField, Unknown
 from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.planning.body import clearance_and_jacobian
-from hiosdf_jax._src.state import Bound
+from hiosdf_jax._src.state.pytrees import Bound
 
 VariableSpheres = Callable[[Any], tuple[jax.Array, Any]]
 """Value of a variable -> the body's spheres: centers_world (S, 3) m and radii (S,) m."""

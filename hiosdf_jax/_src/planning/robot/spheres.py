@@ -32,7 +32,7 @@ from hiosdf_jax._src.planning.robot.geoms import (
     cover_geom,
     describe_geom,
 )
-from hiosdf_jax._src.state import Bound
+from hiosdf_jax._src.state.pytrees import Bound
 
 
 @exportable()

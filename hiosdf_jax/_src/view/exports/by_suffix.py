@@ -10,7 +10,8 @@ import numpy as np
 
 from hiosdf_jax._src.field.baking import bake
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.state import Field, MapState, as_live_field
+from hiosdf_jax._src.state.checks import as_live_field
+from hiosdf_jax._src.state.pytrees import Field, MapState
 from hiosdf_jax._src.view import moments, page, stage
 from hiosdf_jax._src.view.exports import lattices, meshes, navigation, weights
 

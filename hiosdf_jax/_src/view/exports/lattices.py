@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import Baked
+from hiosdf_jax._src.state.pytrees import Baked
 
 _BLOCK_BYTES = 2**20
 _VTK_TYPES = {"f4": "Float32", "u1": "UInt8"}

@@ -13,7 +13,8 @@ from hiosdf_jax._src.field.baking import bake
 from hiosdf_jax._src.field.lattice import check_resolution
 from hiosdf_jax._src.numerics.intake import as_number
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import Field, MapState, as_live_field
+from hiosdf_jax._src.state.checks import as_live_field
+from hiosdf_jax._src.state.pytrees import Field, MapState
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 128
 _OCCUPIED_FROM, _FREE_BELOW = 0.65, 0.196

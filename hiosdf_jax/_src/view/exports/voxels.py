@@ -11,7 +11,8 @@ import numpy as np
 from hiosdf_jax._src.field import queries
 from hiosdf_jax._src.field.lattice import check_resolution, sample_counts
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
-from hiosdf_jax._src.state import Field, MapState, Unknown, as_live_field
+from hiosdf_jax._src.state.checks import as_live_field
+from hiosdf_jax._src.state.pytrees import Field, MapState, Unknown
 
 _CHUNK = 65536
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hiosdf_jax._src.network.forward import layers_of
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.state import Field
+from hiosdf_jax._src.state.pytrees import Field
 
 
 def write_safetensors(path: str | os.PathLike[str], field: Field) -> None:

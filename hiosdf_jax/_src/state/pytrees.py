@@ -1,23 +1,20 @@
-"""The pytrees: the map that `update` carries, and the fields that planners hold."""
+"""The map that `update` carries, and the fields that planners hold."""
 
 from __future__ import annotations
 
 import enum
-import operator
-from typing import Any, Literal, NamedTuple, Self, SupportsIndex, cast
+from typing import Any, Literal, NamedTuple, Self
 
 import flax.serialization
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.numerics.arrays import scalar
 from hiosdf_jax._src.numerics.describing import Described
 from hiosdf_jax._src.numerics.exporting import export_optimizer, exportable
-from hiosdf_jax._src.numerics.intake import is_traced
 
 NO_FEATURE = -128
 """`Derived.nearest` of a voxel without a surface patch within the distance horizon."""
@@ -36,64 +33,6 @@ Bound = Literal["sdf", "lower"]
 def frontier_step_m(config: Config) -> float:
     """Returns the length of a step of `Derived.frontier_steps`, m."""
     return config.frontier_horizon / FRONTIER_STEPS
-
-
-class Flag(enum.IntFlag):
-    """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`.
-
-    `Flag` takes these arrays as they are; of a stack of maps it takes one after the other.
-
-    Example:
-        >>> flags = hio.Flag(state.report.update_flags)
-        >>> hio.Flag.BAD_POSE in flags
-        False
-        >>> print(flags)
-        OUT_OF_RANGE|INCONSISTENT_CLOUD
-    """
-
-    BAD_POSE = 1
-    """A pose was not finite, not rigid, or 100 km away. That update changed nothing else."""
-    EMPTY_CLOUD = 2
-    """A cloud had no finite row. That update changed nothing else."""
-    POINTS_OUTSIDE = 4
-    """Returns in range fell outside the bounds. Their rays cleared space but left no surface. Or
-    surfaces of a map that was moved or merged fell outside, and are lost."""
-    TRAINING_FAILED = 8
-    """Training was not finite. The network was kept as it was, and the next update trains it again;
-    the optimizer is reset if it was the cause."""
-    OUT_OF_RANGE = 16
-    """Almost no return was in range; see `Config.min_in_range`. That update changed nothing else:
-    check the unit, which must be m."""
-    INCONSISTENT_CLOUD = 32
-    """A cloud contradicted the map as a whole. It was not fused, unless `Config.most_refusals`
-    clouds in a row had been refused before it: check the pose and the sensor."""
-    BAD_ARGUMENT = 64
-    """Inside jit, `robot` or `noise` was not finite or out of range. That update changed nothing
-    else."""
-    NOT_REGISTERED = 128
-    """`track` found no pose at which the cloud fits the map. It was not fused."""
-    FUSED_AS_PREDICTED = 256
-    """`track` fused the cloud at its predicted pose: the map was too young to register it."""
-
-    @classmethod
-    def _missing_(cls, value: object) -> Flag:
-        """Takes the bits of a report, which are an array."""
-        if isinstance(value, int):
-            return cast(Flag, super()._missing_(value))
-        try:
-            return cls(operator.index(cast(SupportsIndex, value)))
-        except TypeError as error:
-            raise ValueError(f"flags is {value!r}, expected an integer, as in a report") from error
-
-    def __str__(self) -> str:
-        """Returns the names of the flags with `|` between them, or "none"."""
-        names = [str(flag.name) for flag in type(self) if flag & self]
-        unknown = int(self) & ~sum(type(self))
-        return "|".join([*names, str(unknown)] if unknown else names) or "none"
-
-    def __format__(self, spec: str) -> str:
-        """Formats the names, as `str` does."""
-        return format(str(self), spec)
 
 
 @exportable()
@@ -389,61 +328,6 @@ def _from_flax(state: MapState, data: dict[str, Any]) -> MapState:
 flax.serialization.register_serialization_state(MapState, _to_flax, _from_flax, override=True)
 
 
-_ONE_OF_THEM = "for one of them use jax.tree.map(lambda x: x[i], maps)"
-
-
-def check_map(
-    state: Any, stacked: bool = False, name: str = "state", batched: str | None = None
-) -> None:
-    """Checks that an argument is a map.
-
-    Args:
-        state: The argument.
-        stacked: Whether it may be a stack of maps.
-        name: Name of the argument in error messages.
-        batched: The call that does the same for a stack, for error messages.
-
-    Raises:
-        ValueError: It is no map, or a stack, or was donated.
-    """
-    if not isinstance(state, MapState):
-        raise ValueError(f"{name} is {type(state).__name__}, expected a MapState from hio.init")
-    if stacked:
-        _check_kept(name, state)
-    else:
-        check_single(name, state, batched)
-
-
-def check_single(name: str, field: MapState | Field | Baked, batched: str | None = None) -> None:
-    """Raises a ValueError if an argument is a stack of maps, or arrays that do not match."""
-    _check_kept(name, field)
-    if isinstance(field, Baked):
-        shapes = [np.shape(each) for each in (field.sdf, field.frontier, field.lower)]
-        if len(set(shapes)) > 1:
-            raise ValueError(
-                f"{name} has sdf, frontier and lower of shapes {', '.join(map(str, shapes))}, "
-                "expected equal ones"
-            )
-    voxels = _voxels(field)
-    shape = np.shape(voxels)
-    if len(shape) != 3:
-        advice = f"for {shape[0]} maps at once use {batched}" if batched else _ONE_OF_THEM
-        raise ValueError(f"{name} has voxels of shape {shape}, expected those of one map: {advice}")
-
-
-def _check_kept(name: str, field: MapState | Field | Baked) -> None:
-    voxels = _voxels(field)
-    if isinstance(voxels, jax.Array) and not is_traced(voxels) and voxels.is_deleted():
-        raise ValueError(f"{name} was donated to an update, expected the map that it returned")
-
-
-def _voxels(field: MapState | Field | Baked) -> jax.Array:
-    """Selects the distances at the voxels or samples."""
-    if isinstance(field, Baked):
-        return field.sdf
-    return (field.grid if isinstance(field, MapState) else field.surface).derived.sdf
-
-
 def surface_of(grid: Grid) -> Surface:
     """Selects what queries read of a grid, without a copy."""
     return Surface(mean=grid.evidence.mean, axes=grid.evidence.axes, derived=grid.derived)
@@ -460,23 +344,3 @@ def field_of(state: MapState) -> Field:
         updates=state.updates,
         stamp=scalar(0),
     )
-
-
-def as_live_field(field: MapState | Field, batched: str | None = None) -> Field:
-    """Selects what queries read of a map or of a snapshot, without a copy.
-
-    Args:
-        field: A map or a snapshot of one.
-        batched: As for `check_map`.
-
-    Returns:
-        The field.
-
-    Raises:
-        ValueError: The argument is something else, such as a baked field, or a stack of maps
-            outside `jax.vmap`.
-    """
-    if not isinstance(field, MapState | Field):
-        raise ValueError(f"field is {type(field).__name__}, expected a MapState or a Field")
-    check_single("field", field, batched)
-    return field_of(field) if isinstance(field, MapState) else field
