@@ -43,7 +43,7 @@ from scipy.spatial.transform import Rotation
 import hiosdf_jax as hio
 from benchmarks.registration import error, perturb
 from hiosdf_jax import datasets, demo, scoring
-from hiosdf_jax._src.command.tracker import Tracker
+from hiosdf_jax._src.command.stream_poses import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.judging import LEAST_INLIERS

@@ -30,7 +30,7 @@ from hiosdf_jax._src.mapping.checkpoint import load, save
 from hiosdf_jax._src.mapping.forgetting import forget
 from hiosdf_jax._src.mapping.joining.merging import correct, merge, transform
 from hiosdf_jax._src.mapping.lifecycle import grow, init, snapshot
-from hiosdf_jax._src.mapping.moving import moving_rows
+from hiosdf_jax._src.mapping.moving_returns import moving_rows
 from hiosdf_jax._src.mapping.pipeline import pad_cloud, update
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.registration.relocalizing import Relocalization, relocalize

@@ -9,7 +9,7 @@ import pytest
 from room import CONFIG, arrays_equal, stream
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.background import fusing
+from hiosdf_jax._src.mapping.background import serving
 
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)).astype(np.float32)
 
@@ -43,7 +43,7 @@ def test_the_newest_frame_replaces_the_waiting_one(empty_map, monkeypatch):
         assert go.wait(10)
         return state
 
-    monkeypatch.setattr(fusing, "update", slow)
+    monkeypatch.setattr(serving, "update", slow)
     mapper = hio.BackgroundMapper(empty_map)
     pose = np.eye(4)
     mapper.put(np.zeros((1, 3)), pose)
@@ -75,7 +75,7 @@ class EndlessSensor:
     def fuse(self, frame, _):
         self.put()
         self.state = None
-        return fusing.Published(frame.cloud, frame.stamp)
+        return serving.Published(frame.cloud, frame.stamp)
 
     def fetch(self):
         self.put()
@@ -149,7 +149,7 @@ def test_the_robot_or_the_noise_alone_is_passed_on(empty_map, monkeypatch, given
         passed.append({name: extra for name, extra in extras.items() if extra is not None})
         return state
 
-    monkeypatch.setattr(fusing, "update", record)
+    monkeypatch.setattr(serving, "update", record)
     with hio.BackgroundMapper(empty_map) as mapper:
         mapper.put(*stream(1)[0], **given)
     (extras,) = passed
@@ -181,7 +181,7 @@ def test_a_failure_of_the_thread_is_raised_in_the_caller(empty_map, monkeypatch)
     def broken(*_, **__):
         raise OSError("no device")
 
-    monkeypatch.setattr(fusing, "update", broken)
+    monkeypatch.setattr(serving, "update", broken)
     mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
@@ -303,7 +303,7 @@ def test_an_exception_of_the_controller_is_kept(empty_map, monkeypatch):
     def broken(*_, **__):
         raise OSError("no device")
 
-    monkeypatch.setattr(fusing, "update", broken)
+    monkeypatch.setattr(serving, "update", broken)
     with pytest.raises(KeyError, match="goal"), hio.BackgroundMapper(empty_map) as mapper:
         mapper.put(*stream(1)[0])
         raise KeyError("goal")
@@ -315,7 +315,7 @@ def test_a_failure_can_be_read_without_an_exception(empty_map, monkeypatch):
     def broken(*_, **__):
         raise OSError("no device")
 
-    monkeypatch.setattr(fusing, "update", broken)
+    monkeypatch.setattr(serving, "update", broken)
     mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     with pytest.raises(RuntimeError, match="thread has failed"):
@@ -332,7 +332,7 @@ def test_closing_and_waiting_end_while_a_frame_takes_forever(empty_map, monkeypa
         assert go.wait(30)
         return state
 
-    monkeypatch.setattr(fusing, "update", endless)
+    monkeypatch.setattr(serving, "update", endless)
     mapper = hio.BackgroundMapper(empty_map)
     mapper.put(*stream(1)[0])
     for call in (mapper.wait, mapper.close):

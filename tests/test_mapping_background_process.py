@@ -15,7 +15,8 @@ from room import arrays_equal, stream
 from test_mapping_background import BAD_FRAMES, POINTS
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.mapping.background import child, fusing, worker
+from hiosdf_jax._src.mapping.background import child, worker
+from hiosdf_jax._src.mapping.background import serving as frame_loop
 
 HERE = Path(__file__).parent
 START = child._START
@@ -200,8 +201,8 @@ def test_an_exception_that_pickle_cannot_write_still_arrives(empty_map, monkeypa
     def broken(*_, **__):
         raise LocalError("no device")
 
-    monkeypatch.setattr(fusing, "update", broken)
-    frame = fusing.Frame(*stream(1)[0], 0.0)
-    answer = worker._answer(fusing.Fuser(empty_map), "fuse", frame, child.pack_serve(None))
+    monkeypatch.setattr(frame_loop, "update", broken)
+    frame = frame_loop.Frame(*stream(1)[0], 0.0)
+    answer = worker._answer(frame_loop.Fuser(empty_map), "fuse", frame, child.pack_serve(None))
     assert isinstance(answer.raised, RuntimeError)
     assert str(answer.raised) == "LocalError: no device"

@@ -38,7 +38,7 @@ from hiosdf_jax._src.output_files import check_output, replacing_together
 
 # Heavy imports are inside the functions, so that `hiosdf --help` responds at once.
 if TYPE_CHECKING:
-    from hiosdf_jax._src.command.tracker import Tracker
+    from hiosdf_jax._src.command.stream_poses import Tracker
     from hiosdf_jax._src.datasets.stream import Stream
 
 _NOT_REACHED = 1  # exit code
@@ -218,7 +218,7 @@ def _map(options: argparse.Namespace) -> None:
 def _tracker(options: argparse.Namespace, stream: Stream) -> Tracker | None:
     if not (options.odometry or options.refine_poses):
         return None
-    from hiosdf_jax._src.command.tracker import Tracker
+    from hiosdf_jax._src.command.stream_poses import Tracker
 
     return Tracker(options.odometry, options.drift, stamps_of(stream))
 

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from hiosdf_jax._src.command.progress import FrameDigest, Progress, SavedMap
-from hiosdf_jax._src.command.tracker import Tracker
+from hiosdf_jax._src.command.stream_poses import Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
 from hiosdf_jax._src.mapping import lifecycle, pipeline

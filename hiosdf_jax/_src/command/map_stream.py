@@ -16,7 +16,7 @@ from hiosdf_jax._src.command import report
 from hiosdf_jax._src.command.live_map import LiveMap
 from hiosdf_jax._src.command.map_frames import Mapped, fuse_frames, return_freed_memory
 from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
-from hiosdf_jax._src.command.tracker import TRAJECTORY, Tracker
+from hiosdf_jax._src.command.stream_poses import TRAJECTORY, Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.datasets.truth import GroundTruth

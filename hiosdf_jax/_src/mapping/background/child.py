@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.mapping.background.fusing import Frame, Published, RefusedError, Serve
+from hiosdf_jax._src.mapping.background.serving import Frame, Published, RefusedError, Serve
 from hiosdf_jax._src.state.pytrees import MapState
 
 # The kernel prefers every other process from the first import on: threads keep the priority that

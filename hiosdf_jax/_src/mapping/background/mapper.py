@@ -12,7 +12,7 @@ import numpy as np
 
 from hiosdf_jax._src.mapping.background.child import Child, pack_serve
 from hiosdf_jax._src.mapping.background.ending import end_with_interpreter
-from hiosdf_jax._src.mapping.background.fusing import (
+from hiosdf_jax._src.mapping.background.serving import (
     Frame,
     Fuser,
     RefusedError,

@@ -15,7 +15,7 @@ import jax
 
 from hiosdf_jax._src.mapping.background import child
 from hiosdf_jax._src.mapping.background.child import Answer, Warned, to_device, to_host
-from hiosdf_jax._src.mapping.background.fusing import Frame, Fuser, RefusedError
+from hiosdf_jax._src.mapping.background.serving import Frame, Fuser, RefusedError
 
 _LOOK_FOR_PARENT_S = 0.5
 

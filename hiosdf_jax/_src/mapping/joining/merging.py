@@ -17,7 +17,7 @@ from hiosdf_jax._src.grid.evidence import empty_grid, whole_window, write_window
 from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.mapping.joining.adding import Moved, sum_evidence
 from hiosdf_jax._src.mapping.joining.rebinning import coincides, count_lost, passes_at, rebin
-from hiosdf_jax._src.network.frames import move_network
+from hiosdf_jax._src.network.rigid_motion import move_network
 from hiosdf_jax._src.network.training import least_epochs, train
 from hiosdf_jax._src.numerics.intake import as_array, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import cond, plain, varying_like

@@ -6,7 +6,7 @@ import numpy as np
 from room import arrays_equal
 from scipy.spatial.transform import Rotation
 
-from hiosdf_jax._src.network.frames import move_network
+from hiosdf_jax._src.network.rigid_motion import move_network
 
 
 def answers(network, config, params, points):

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
-from hiosdf_jax._src.command import cli, map_stream, tracker
+from hiosdf_jax._src.command import cli, map_stream, stream_poses
 from hiosdf_jax._src.command.inputs import find_bounds_around_start
-from hiosdf_jax._src.command.tracker import TRAJECTORY, Tracker, continued, without_flips
+from hiosdf_jax._src.command.stream_poses import TRAJECTORY, Tracker, continued, without_flips
 from hiosdf_jax._src.datasets.stream import BadFrameError, FrameStream
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
 from hiosdf_jax._src.mapping.registration.refining import Registration
@@ -295,8 +295,8 @@ def test_the_prior_of_a_drift_grows_with_the_way(monkeypatch):
         found = Registration(predicted, jnp.eye(6), zero, zero, jnp.asarray(True))
         return SimpleNamespace(updates=state.updates + 1), found
 
-    monkeypatch.setattr(tracker, "track", note)
-    tracked: Any = tracker.Tracker(odometry=False, drift=(0.01, 0.2))
+    monkeypatch.setattr(stream_poses, "track", note)
+    tracked: Any = stream_poses.Tracker(odometry=False, drift=(0.01, 0.2))
     given = np.stack([np.eye(4)] * 4)
     given[:, 0, 3] = [0, 0, 0.02, 0.52]
     given[3, :3, :3] = Rotation.from_euler("z", 0.3).as_matrix()
