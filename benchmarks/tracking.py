@@ -107,7 +107,7 @@ def map_stream(frames, config, mode, seed=0):
     state = hio.init(config, jax.random.key(0))
     poses, refused = [], []
     for i, (cloud, _) in enumerate(frames):
-        pose, fused = given[i], True
+        pose, registered = given[i], True
         if mode == "glitch left out" and i in GLITCH:
             poses.append(pose)
             continue
@@ -116,12 +116,12 @@ def map_stream(frames, config, mode, seed=0):
         elif mode.startswith("jitter"):
             known = (pose, JITTER_COVARIANCE) if mode == "jitter known" else None
             state, found = hio.track(state, cloud, pose, known)
-            pose, fused = found.pose, bool(found.converged)
+            pose, registered = found.pose, bool(found.converged)
         else:
             state, pose = tracker.fuse(state, cloud, pose, i)
-            fused = tracker.frames[-1].registered
+            registered = tracker.frames[-1].registered
         poses.append(np.asarray(pose))
-        if not fused:
+        if not registered:
             refused.append(i)
     if mode == "jitter smoothed":
         state, poses, refused = map_again(frames, config, given, poses, refused)

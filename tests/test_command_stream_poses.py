@@ -158,7 +158,7 @@ def test_a_folder_of_clouds_without_poses_is_mapped_by_odometry(
     stream, output = write_folder(tmp_path / "scans", clouds, names), tmp_path / "out"
     assert cli.main(["map", stream, "--odometry", "--output", str(output)]) == 0
     text = capsys.readouterr().out
-    assert "mapping 3 m around what it sees from its first position (--bounds sets" in text
+    assert "mapping 3 m around what the sensor sees from its first position (--bounds sets" in text
     timed = read_timed_poses(output / "trajectory.txt")
     np.testing.assert_allclose(timed.stamps, 1e-9 * names, rtol=0, atol=1e-6)
     found = np.stack([pose_at(timed, stamp, 0.1) for stamp in timed.stamps])
@@ -250,6 +250,27 @@ def test_the_velocity_is_kept_over_missing_frames(stamps, seconds):
         found = Registration(pose, np.eye(6), 0.0, 0.0, True)
         tracked._add(frame, np.eye(4), found, True)
     np.testing.assert_allclose(tracked.predict(np.eye(4), 5), screw(seconds), atol=1e-3)
+
+
+def test_frames_that_do_not_fit_do_not_change_the_velocity():
+    tracked = Tracker(odometry=True, stamps=np.array([0.1, 0.2, 2.2, 2.3]))
+    zero = np.float32(0)
+    for frame in (0, 1):
+        found = Registration(screw(0.1 * frame), np.eye(6), zero, zero, np.asarray(True))
+        tracked._add(frame, np.eye(4), found, True)
+    missed = found._replace(pose=tracked.predict(np.eye(4), 2), converged=np.asarray(False))
+    tracked._add(2, np.eye(4), missed, False)
+    # Five times as long as the velocity was measured, from the last frame that fits.
+    np.testing.assert_allclose(tracked.predict(np.eye(4), 3), screw(0.1 + 0.5), atol=1e-3)
+
+
+def test_a_held_out_frame_that_does_not_fit_has_the_covariance_of_its_prediction(monkeypatch):
+    zero = jnp.float32(0)
+    wrong = Registration(jnp.eye(4), 1e-8 * jnp.eye(6), zero, zero, jnp.asarray(False))
+    monkeypatch.setattr(stream_poses, "refine_pose", lambda *_, **__: wrong)
+    tracked: Any = Tracker(odometry=False)
+    tracked.locate(None, None, np.eye(4), 0)
+    assert np.sqrt(np.diag(tracked.frames[0].covariance)).min() > 0.01
 
 
 def test_a_stream_that_is_lost_says_since_when(tmp_path, quick, capsys):

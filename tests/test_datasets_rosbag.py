@@ -291,13 +291,41 @@ def test_bags_without_motion_or_clouds(tmp_path):
         open_stream(path)
     np.testing.assert_allclose(open_stream(path, world_frame="base")[0][1], MOUNT, atol=1e-6)
     path = write_bag(tmp_path / "apart", "ros1", moving="odometry", static=False)
+    with pytest.raises(NoPosesError, match="nothing moves above the cloud's frame, lidar"):
+        open_stream(path)
     with pytest.raises(
         ValueError, match=r"/odometry moves \['base'\], expected one of \['lidar'\]"
     ):
-        open_stream(path)
+        open_stream(path, odometry_topic="/odometry")
     path = write_bag(tmp_path / "blind", "ros1", clouds=False)
     with pytest.raises(ValueError, match=r"cloud_topic = None, expected one of \[\]"):
         open_stream(path)
+
+
+def test_a_sensor_that_stands_still_ignores_the_odometry_of_another_robot(tmp_path):
+    with Bag(tmp_path / "hall", "ros1") as bag:
+        for time in np.arange(START, START + 1, 0.1):
+            bag.write_transform(time, "map", "lidar", MOUNT)
+            bag.write_odometry(time, "odom", "base", motion(time))
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud)
+    with pytest.raises(NoPosesError, match="or a world_frame if the sensor stands still"):
+        open_stream(bag.path)
+    np.testing.assert_allclose(open_stream(bag.path, world_frame="map")[0][1], MOUNT, atol=1e-6)
+
+
+def test_a_world_frame_that_only_tf_has_chooses_tf(tmp_path):
+    """Odometry would put another frame above the base."""
+    with Bag(tmp_path / "arm", "ros1") as bag:
+        for time in np.arange(START, START + 1, 0.05):
+            bag.write_transform(time, "base", "lidar", motion(time))
+            bag.write_transform(time, "world", "base", MOUNT)
+            bag.write_odometry(time, "odom", "base", motion(time))
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.write_cloud(stamp, cloud)
+    poses = [open_stream(bag.path, world_frame="world")[i][1] for i in (0, 3)]
+    expected = [MOUNT @ motion(STAMPS[i]) for i in (0, 3)]
+    np.testing.assert_allclose(poses, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("moving", ["", "tf", "odometry"])

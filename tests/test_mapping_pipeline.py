@@ -285,7 +285,14 @@ def test_flags_print_their_names(flags, names):
 @pytest.mark.parametrize("kind", [jnp.uint32, np.uint32, np.array])
 @pytest.mark.parametrize("bits", [0, 2, 48, 1 + 2**20])
 def test_flags_are_made_of_the_array_in_a_report(kind, bits):
-    assert hio.Flag(kind(bits)) is hio.Flag(bits)
+    array = kind(bits)
+    with jax.transfer_guard("disallow"):
+        assert hio.Flag(array) is hio.Flag(bits)
+
+
+def test_flags_of_a_stack_are_refused():
+    with pytest.raises(ValueError, match=r"flags has shape \(2,\), expected \(\)"):
+        hio.Flag(jnp.array([1, 2], jnp.uint32))
 
 
 @pytest.mark.parametrize("value", [2.5, np.float32(2.5), "2", None])

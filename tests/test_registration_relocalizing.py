@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.field.lattice import sample_counts
+from hiosdf_jax._src.mapping.registration.refining import Registration
 from hiosdf_jax._src.mapping.registration.relocalizing import (
     _ROUNDS,
+    Relocalization,
     _Cells,
     _copy,
     _hypotheses_for,
@@ -219,3 +221,16 @@ def test_wrong_input_is_named(empty_map, change, message):
     arguments = {"field": empty_map, "cloud": view(0)[0], "key": jax.random.key(0)}
     with pytest.raises(ValueError, match=message):
         hio.relocalize(**arguments | change)
+
+
+@pytest.mark.parametrize(
+    ("converged", "score", "other_score", "sure"),
+    [(True, 0.8, 0.6, True), (True, 0.8, 0.75, False), (False, 0.9, 0.1, False)],
+)
+def test_a_place_is_sure_if_it_has_converged_and_fits_clearly_better(
+    converged, score, other_score, sure
+):
+    zero = jnp.float32(0)
+    best = Registration(jnp.eye(4), jnp.eye(6), zero, zero, jnp.asarray(converged))
+    place = Relocalization(best, jnp.float32(score), best, jnp.float32(other_score))
+    assert bool(place.sure) == sure

@@ -169,7 +169,7 @@ def _target(path: _Path) -> Path:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "not a regular file", os.fspath(path))
-    # Moving a file into place needs permissions on its folder alone; here its own ones count.
+    # A move needs only the folder's permissions. A read-only file is refused all the same.
     if not found.st_mode & 0o222 or not os.access(target, os.W_OK, effective_ids=True):
         raise PermissionError(errno.EACCES, "the file is read-only", os.fspath(path))
     return target

@@ -25,7 +25,7 @@ from hiosdf_jax._src.view.paths import save_paths
 TRAJECTORY = ("trajectory.txt", "trajectory.npz", "trajectory.png")
 
 _LEAST_DISTANCE_M = 0.05  # shorter distances drift as this one does
-_MOST_AHEAD = 5  # times the last motion; farther ahead its errors grow more than it foretells
+_MOST_AHEAD = 5  # times the last motion; farther ahead the prediction is worse than none
 _LOST_FRAMES = 5  # a stream is lost if this many frames at its end do not fit
 
 
@@ -98,9 +98,10 @@ class Tracker:
         if not self._odometry:
             reference = self._reference
             return np.asarray(predict_pose(reference.pose, reference.given, given))
-        if len(self.frames) < 2:
-            return self.frames[-1].pose
-        before, last = self.frames[-2:]
+        fitting = [each for each in self.frames if each.fused][-2:]
+        if len(fitting) < 2:
+            return self._reference.pose
+        before, last = fitting
         times = self._times(before.frame, last.frame, frame)
         ahead = min((times[2] - times[1]) / (times[1] - times[0]), _MOST_AHEAD)
         return continued(before.pose, last.pose, ahead)
@@ -133,7 +134,9 @@ class Tracker:
         moved = max(distance_and_angle(found.pose, jnp.asarray(predicted)))
         near = bool(found.converged) and float(moved) <= MOST_MOVED * GROWING_REACH_M
         if not near:
-            found = found._replace(pose=predicted, converged=jnp.asarray(False))
+            found = found._replace(
+                pose=predicted, covariance=prior[1], converged=jnp.asarray(False)
+            )
         return self._add(frame, given, found, near)
 
     def counts(self) -> dict[str, int | None]:

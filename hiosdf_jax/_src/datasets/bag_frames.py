@@ -107,7 +107,7 @@ def _odometry_edges(
     moved = _edges(path, odometry[topic])
     above = path_up(edges | moved, sensor)
     if moved.keys().isdisjoint(above):
-        raise NoPosesError(
+        raise ValueError(
             f"{path}: odometry topic {topic} moves {list(moved)}, expected one of {above}, the "
             "frames from the cloud's frame upward"
         )
@@ -149,7 +149,8 @@ def _default_odometry(
     """Returns the odometry topic that has the motion of the sensor, None if tf has it."""
     joints = moving(edges, path_up(edges, sensor))
     if not joints:
-        return next(iter(odometry)) if len(odometry) == 1 else None
+        topics = [topic for topic, rows in odometry.items() if rows[0][0] in path_up(edges, sensor)]
+        return topics[0] if len(topics) == len(odometry) == 1 else None
     rivals = [
         topic
         for topic, rows in odometry.items()
@@ -158,7 +159,7 @@ def _default_odometry(
     known = [_tf_has(edges, sensor, *odometry[topic][0][:2]) for topic in rivals]
     if not rivals or True in known:
         return None
-    if known == [False]:
+    if known == [False] and not _only_tf_has(edges, odometry[rivals[0]], sensor, world_frame, path):
         return rivals[0]
     if world_frame is not None:
         return None
@@ -167,6 +168,18 @@ def _default_odometry(
         f"{[odometry[topic][0][0] for topic in rivals]}; expected odometry_topic= or world_frame= "
         "to choose odometry or tf as the motion of the sensor"
     )
+
+
+def _only_tf_has(
+    edges: dict[str, Edge],
+    rows: list[Transform],
+    sensor: str,
+    world_frame: str | None,
+    path: Path,
+) -> bool:
+    """Returns whether a frame is above the sensor in tf, and not with an odometry laid over it."""
+    above = path_up(edges | _edges(path, rows), sensor)
+    return world_frame in path_up(edges, sensor) and world_frame not in above
 
 
 def _tf_has(edges: dict[str, Edge], sensor: str, child: str, parent: str) -> bool | None:

@@ -5,9 +5,9 @@
 
 If the file names are times within the trajectory (seconds, or nanoseconds as whole numbers), each
 cloud gets the pose interpolated at its time. Otherwise there must be as many poses as clouds, and
-the poses belong to the clouds in the order of their names. So they do where the trajectory only
-numbers as many poses as there are clouds: 0, 1, 2, ... A file that begins with `# frame`, as a run
-writes it, has numbers of clouds in this order, from 0, and may lack some.
+the poses belong to the clouds in the order of their names. If there are as many poses as clouds,
+the times 0, 1, 2, ... are also numbers of clouds in this order. A file that begins with `# frame`,
+as a run writes it, has numbers of clouds, from 0, and may lack some.
 
 With as many poses as clouds, both readings may give poses, but not the same ones. If the times then
 leave a cloud without a pose, the folder is refused. Without poses the file names are the times, if

@@ -6,6 +6,7 @@ Its shape depends on the sensor alone, so one compilation serves a stream.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -43,7 +44,7 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
     if intrinsics.shape != (3, 3):
         raise ValueError(f"intrinsics has shape {intrinsics.shape}, expected (3, 3)")
     if not is_traced(intrinsics):
-        check_camera("intrinsics", np.asarray(intrinsics))
+        check_camera("intrinsics", jax.device_get(intrinsics))
     height, width = depth.shape[-2:]
     v = (jnp.arange(height) - intrinsics[1, 2])[:, None] / intrinsics[1, 1]
     # K[0, 1] is the skew, 0 for nearly all cameras but part of K.

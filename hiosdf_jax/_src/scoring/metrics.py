@@ -170,7 +170,9 @@ def explain_missing(truth: GroundTruth, last_frame: int | None) -> dict[str, str
     """
     if last_frame is None or (np.asarray(truth.frame) <= last_frame).all():
         return {}
-    return {"surface_cm": "it is scored once all frames are mapped: surface points carry no frame"}
+    reason = "it is scored once all frames are mapped: its points carry no frame"
+    names = ["surface_cm", *(["thin_share"] if len(truth.thin_points_world) else [])]
+    return dict.fromkeys(names, reason)
 
 
 def evaluate_bands(

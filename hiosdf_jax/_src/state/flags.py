@@ -4,13 +4,38 @@ from __future__ import annotations
 
 import enum
 import operator
-from typing import SupportsIndex, cast
+from typing import Any
+
+import jax
+import numpy as np
 
 
-class Flag(enum.IntFlag):
+class _TakesArrays(enum.EnumType):
+    """Lets `Flag` take the bits of a report, which are an array."""
+
+    def __call__(cls, value: Any, *args: Any, **options: Any) -> Any:
+        # An enum would compare an array, which has no hash, with each of its members.
+        if hasattr(value, "dtype"):
+            if np.ndim(value):
+                raise ValueError(
+                    f"flags has shape {np.shape(value)}, expected (): for a stack of maps call "
+                    "Flag with each element"
+                )
+            value = jax.device_get(value)
+        if not args:
+            try:
+                value = operator.index(value)
+            except TypeError as error:
+                raise ValueError(
+                    f"flags is {value!r}, expected an integer, as in a report"
+                ) from error
+        return super().__call__(value, *args, **options)
+
+
+class Flag(enum.IntFlag, metaclass=_TakesArrays):
     """Problems of an update: bits of `Report.update_flags` and, for all updates, `Report.flags`.
 
-    `Flag` takes these arrays as they are; of a stack of maps it takes one after the other.
+    `Flag` takes these arrays as they are. For a stack of maps call it with each element.
 
     Example:
         >>> flags = hio.Flag(state.report.update_flags)
@@ -43,16 +68,6 @@ class Flag(enum.IntFlag):
     """`track` found no pose at which the cloud fits the map. It was not fused."""
     FUSED_AS_PREDICTED = 256
     """`track` fused the cloud at its predicted pose: the map was too young to register it."""
-
-    @classmethod
-    def _missing_(cls, value: object) -> Flag:
-        """Takes the bits of a report, which are an array."""
-        if isinstance(value, int):
-            return cast(Flag, super()._missing_(value))
-        try:
-            return cls(operator.index(cast(SupportsIndex, value)))
-        except TypeError as error:
-            raise ValueError(f"flags is {value!r}, expected an integer, as in a report") from error
 
     def __str__(self) -> str:
         """Returns the names of the flags with `|` between them, or "none"."""

@@ -33,10 +33,10 @@ _SHARED = ("voxel_size", "range_noise", "hidden_width", "hidden_layers", "freque
 # After a merge the network learns what the other map knew, in this many trainings of
 # `Config.warmup_epochs` on samples of the whole grid. Each keeps half of the old average.
 _TRAININGS = 10
+_AVERAGE = 0.5
 
 # Outside jit a warning says if a larger share of the surface falls outside of the box.
 _MOST_LOST = 0.01
-_AVERAGE = 0.5
 
 
 def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
@@ -153,9 +153,10 @@ def _joined(config: Config, parts: tuple[tuple[MapState, jax.Array | None], ...]
     if is_traced(*jax.tree.leaves(parts)):
         return _join(config, parts)[0]
     result, lost = _join_jit(config, parts)
-    if float(lost) > _MOST_LOST:
+    share = float(jax.device_get(lost))
+    if share > _MOST_LOST:
         warnings.warn(
-            f"{100 * float(lost):.2g} % of the surface patches fall outside of the box and are "
+            f"{100 * share:.2g} % of the surface patches fall outside of the box and are "
             f"lost: pass larger bounds than {config.bounds}, or grow the map first",
             stacklevel=3,
         )
@@ -221,9 +222,7 @@ def _join(
     report = states[0].report
     for state in states[1:]:
         report = report.replace(flags=report.flags | state.report.flags)
-    report = report.replace(
-        flags=report.flags | flags, update_flags=jnp.where(flags > 0, flags, report.update_flags)
-    )
+    report = report.replace(flags=report.flags | flags, update_flags=flags)
     updates = sum(jnp.where(use, state.updates, 0) for use, state in zip(used, states, strict=True))
     result = MapState(
         config=config,

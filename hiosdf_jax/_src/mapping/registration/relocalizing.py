@@ -214,8 +214,10 @@ def _find_places(
     fewer = take_evenly(rows, _KEPT_ROWS)
 
     def improve(start: jax.Array) -> tuple[jax.Array, jax.Array]:
-        still, frozen, begin = jax.lax.stop_gradient((field, fewer, start))
-        pose, share = solve_coarse(still, frozen, begin, Anchor(begin, None), COMPLETE_REACH_M)
+        fixed_field, fixed_rows, begin = jax.lax.stop_gradient((field, fewer, start))
+        pose, share = solve_coarse(
+            fixed_field, fixed_rows, begin, Anchor(begin, None), COMPLETE_REACH_M
+        )
         pose = jnp.where(jnp.all(jnp.isfinite(pose)), pose, start)
         return pose, _score(field, rows._replace(share=share), pose)
 

@@ -56,7 +56,7 @@ _DAMPING = 1e-5
 # Where the returns have more than this mean loss after the coarse steps, they may have come to a
 # wrong minimum. Most right poses of held-out frames have 0.016 to 0.02, wrong ones 0.04 to 0.2.
 _MOST_LOSS = 0.03
-_LEAST_KNOWN = 0.3  # share of the returns about which the map must tell something
+_LEAST_KNOWN = 0.3  # share of the returns that the map must be able to judge
 
 # Then the steps begin again, this far from the given pose, m and rad, in directions to the corners
 # of tetrahedra. Of 210 poses in the apartment, 15 cm and 6 degrees off, one start loses 7, and five
