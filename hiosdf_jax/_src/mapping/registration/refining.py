@@ -76,7 +76,7 @@ class Registration(NamedTuple):
         residual: Root mean square distance of the inliers from the surface, () float32, m.
         inliers: Share of the returns in observed space that lie on a surface, () float32.
         converged: The steps came to rest, and enough returns support the pose, () bool; see
-            docs/poses.md. Where it is False, the other values must not be used.
+            docs/registration.md. Where it is False, the other values must not be used.
     """
 
     pose: jax.Array
@@ -101,7 +101,7 @@ def refine_pose(
     Robust Gauss-Newton steps on the distances, in which outliers lose their weight. The pose may
     be 15 cm and 6 degrees off. If the cloud does not fit after these steps, others start from
     other poses. Pure: works inside `jit`, `vmap` and `lax.scan`. Differentiable by the field, the
-    cloud and the prior; see docs/poses.md.
+    cloud and the prior; see docs/registration.md.
 
     Args:
         field: A map, a snapshot of one, or a baked field.
