@@ -60,7 +60,7 @@ def test_a_frame_of_another_place_changes_nothing_but_the_flags(sharp_map):
     assert arrays_equal(same, sharp_map)
 
 
-@pytest.mark.parametrize("shift", [(0.5, 0, 0), (-0.5, 0, 0), (0.3, 0.3, 0), (-0.7, 0, 0)])
+@pytest.mark.parametrize("shift", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (-0.7, 0, 0)])
 def test_a_prediction_whose_rays_go_through_a_wall_is_refused(sharp_map, shift):
     """Most returns fit: those on the walls along the shift, the floor and the ceiling."""
     cloud, pose = room_cloud(100, COUNT)
