@@ -32,7 +32,7 @@ _LEAST_SHARE = 0.4
 _ALLOWANCE = 0.02
 
 # Returns in free space may be of a person. Nothing new explains rays through known solids, so each
-# counts as this many returns. A share of them is allowed: behind walls that were seen from one
+# counts as this many more returns above a share that is usual: behind walls that were seen from one
 # side, solids are a guess. With half of it, the apartment's map refused a view through a door, and
 # then the next twelve: what would have cleared the guess was not fused. At right poses 0.07 of the
 # rays are blocked there, and at most 0.03 in four recordings, but for one frame.
@@ -82,8 +82,8 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
     rays = take_evenly(rows, _RAYS)
     blocked = find_blocked(field, pose, rays.points, rays.some)
     blocked_share = jnp.sum(blocked) / jnp.maximum(jnp.sum(rays.some), 1)
-    blocked_share = jnp.maximum(blocked_share - _BLOCKED_ALLOWANCE, 0)
-    contrary = jnp.sum(judged & ~on_surface) + _BLOCKED_WEIGHT * blocked_share * total
+    blocked_share += _BLOCKED_WEIGHT * jnp.maximum(blocked_share - _BLOCKED_ALLOWANCE, 0)
+    contrary = jnp.sum(judged & ~on_surface) + blocked_share * total
     supporting = variety * inliers + _ALLOWANCE * total
 
     share = inliers.astype(jnp.float32) / jnp.maximum(jnp.sum(judged), 1).astype(jnp.float32)
