@@ -47,8 +47,7 @@ from hiosdf_jax._src.command.stream_poses import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.judging import LEAST_INLIERS
-from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
-from hiosdf_jax._src.mapping.tracking import MOST_MOVED, prior_of_prediction
+from hiosdf_jax._src.mapping.tracking import is_near, prior_of_prediction
 
 MODES = (
     "exact",
@@ -220,7 +219,7 @@ def _refine_from(state, cloud, start):
     """Refines a pose as `track` does; returns it, and whether it is as near as `track` demands."""
     prior = prior_of_prediction(start, GROWING_REACH_M)
     found = hio.refine_pose(state, cloud, start, prior, reach_m=GROWING_REACH_M)
-    return found, max(distance_and_angle(found.pose, start)) <= MOST_MOVED * GROWING_REACH_M
+    return found, bool(is_near(start, found.pose, GROWING_REACH_M))
 
 
 def print_relocalization(stream, frames, numbers, field, up_world):

@@ -253,7 +253,7 @@ def pan(time):
 
 @pytest.mark.parametrize("above", [None, still])
 def test_transforms_that_do_not_move_the_robot_leave_that_to_odometry(tmp_path, above):
-    """As of ROS 1's static_transform_publisher, and of a joint under the lidar."""
+    """Such as from ROS 1's static_transform_publisher, and of a joint under the lidar."""
     wheels = ("/wheels", "base")
     check_stream(open_stream(write_joint(tmp_path / "still", still, wheels, above=above)))
     path = write_joint(tmp_path / "pan", pan, wheels, above=above)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
@@ -11,6 +11,9 @@ from hiosdf_jax._src.mapping import checkpoint
 from hiosdf_jax._src.mapping.lifecycle import snapshot
 from hiosdf_jax._src.scoring import metrics
 from hiosdf_jax._src.state.pytrees import MapState
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def score_map(
@@ -35,9 +38,28 @@ def score_map(
         last_frame = notes["next_frame"] - 1
         if not (truth.frame <= last_frame).any():
             raise ValueError(f"{os.fspath(path)}: no exact distance belongs to its frames")
-    queries = CompiledQueries(snapshot(state))
-    scores = metrics.evaluate(queries.sdf_and_grad, truth, None, last_frame)
+    return scores_of(CompiledQueries(snapshot(state)), truth, None, last_frame)
+
+
+def scores_of(
+    queries: CompiledQueries,
+    truth: GroundTruth,
+    sensor_world: np.ndarray | None,
+    last_frame: int | None,
+) -> dict[str, dict[str, Any]]:
+    """Scores a map against exact distances.
+
+    Args:
+        queries: The queries of the map.
+        truth: Exact distances.
+        sensor_world: (3,) m, the position of the sensor, if it is known.
+        last_frame: The last frame of the stream that was mapped; None for all of them.
+
+    Returns:
+        `scores` and `bands`, and `not_scored` if a score has no value, as in `metrics.json`.
+    """
+    scores = metrics.evaluate(queries.sdf_and_grad, truth, sensor_world, last_frame)
     scores |= metrics.evaluate_lower(queries.lower, truth, last_frame)
-    bands = metrics.evaluate_bands(queries.sdf_and_grad, truth, None, last_frame)
+    bands = metrics.evaluate_bands(queries.sdf_and_grad, truth, sensor_world, last_frame)
     missing = metrics.explain_missing(truth, last_frame)
     return {"scores": scores, "bands": bands} | ({"not_scored": missing} if missing else {})

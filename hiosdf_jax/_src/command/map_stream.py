@@ -15,6 +15,7 @@ import numpy as np
 from hiosdf_jax._src.command import report
 from hiosdf_jax._src.command.live_map import LiveMap
 from hiosdf_jax._src.command.map_frames import Mapped, fuse_frames, return_freed_memory
+from hiosdf_jax._src.command.map_scores import scores_of
 from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
 from hiosdf_jax._src.command.stream_poses import TRAJECTORY, Tracker
 from hiosdf_jax._src.config import Config
@@ -24,7 +25,7 @@ from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.field.mesh import extract_mesh
 from hiosdf_jax._src.mapping import checkpoint, lifecycle
 from hiosdf_jax._src.output_files import replacing_together
-from hiosdf_jax._src.scoring import held_out, metrics
+from hiosdf_jax._src.scoring import held_out
 from hiosdf_jax._src.state.pytrees import MapState, field_of
 from hiosdf_jax._src.view import drawing
 from hiosdf_jax._src.view.growing import Stage, save_growing
@@ -226,8 +227,4 @@ def _score(queries: CompiledQueries, mapped: Mapped, truth: GroundTruth) -> dict
     if not (truth.frame <= last_frame).any():  # the run ended early
         print("no exact distance belongs to the frames so far: the map is not scored")
         return {}
-    scores = metrics.evaluate(queries.sdf_and_grad, truth, sensor_world, last_frame)
-    scores |= metrics.evaluate_lower(queries.lower, truth, last_frame)
-    bands = metrics.evaluate_bands(queries.sdf_and_grad, truth, sensor_world, last_frame)
-    missing = metrics.explain_missing(truth, last_frame)
-    return {"scores": scores, "bands": bands} | ({"not_scored": missing} if missing else {})
+    return scores_of(queries, truth, sensor_world, last_frame)

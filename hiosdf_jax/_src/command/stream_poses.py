@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
-from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.refining import Registration, refine_pose
 from hiosdf_jax._src.mapping.tracking import (
-    MOST_MOVED,
+    is_near,
     predict_pose,
     prior_of_prediction,
     track,
@@ -81,7 +80,7 @@ class Tracker:
         self._odometry = odometry
         self._drift = drift
         self._stamps = stamps
-        self._reference: Tracked | None = None  # the last frame that fits
+        self._fitting: list[Tracked] = []  # the last two frames that fit
 
     def predict(self, given: np.ndarray, frame: int) -> np.ndarray:
         """Predicts the pose of the next frame.
@@ -93,25 +92,24 @@ class Tracker:
         Returns:
             (4, 4) T_world_sensor.
         """
-        if self._reference is None:
+        if not self._fitting:
             return given
+        last = self._fitting[-1]
         if not self._odometry:
-            reference = self._reference
-            return np.asarray(predict_pose(reference.pose, reference.given, given))
-        fitting = [each for each in self.frames if each.fused][-2:]
-        if len(fitting) < 2:
-            return self._reference.pose
-        before, last = fitting
+            return np.asarray(predict_pose(last.pose, last.given, given))
+        if len(self._fitting) < 2:
+            return last.pose
+        before = self._fitting[0]
         times = self._times(before.frame, last.frame, frame)
         ahead = min((times[2] - times[1]) / (times[1] - times[0]), _MOST_AHEAD)
         return continued(before.pose, last.pose, ahead)
 
     def prior_of(self, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns the prior of a predicted pose (4, 4), or None where the drift is not known."""
-        if self._drift is None or self._reference is None:
+        if self._drift is None or not self._fitting:
             return None
         share, degrees = self._drift
-        moved_m = float(np.linalg.norm(predicted[:3, 3] - self._reference.pose[:3, 3]))
+        moved_m = float(np.linalg.norm(predicted[:3, 3] - self._fitting[-1].pose[:3, 3]))
         deviation = max(moved_m, _LEAST_DISTANCE_M) * np.repeat([share, np.radians(degrees)], 3)
         return predicted, np.diag(deviation**2)
 
@@ -131,13 +129,12 @@ class Tracker:
         predicted = self.predict(given, frame)
         prior = self.prior_of(predicted) or prior_of_prediction(predicted, GROWING_REACH_M)
         found = refine_pose(state, cloud, predicted, prior, reach_m=GROWING_REACH_M)
-        moved = max(distance_and_angle(found.pose, jnp.asarray(predicted)))
-        near = bool(found.converged) and float(moved) <= MOST_MOVED * GROWING_REACH_M
-        if not near:
+        fits = bool(found.converged & is_near(jnp.asarray(predicted), found.pose, GROWING_REACH_M))
+        if not fits:
             found = found._replace(
                 pose=predicted, covariance=prior[1], converged=jnp.asarray(False)
             )
-        return self._add(frame, given, found, near)
+        return self._add(frame, given, found, fits)
 
     def counts(self) -> dict[str, int | None]:
         """How the frames fit the map, by the keys of `metrics.json`.
@@ -213,7 +210,7 @@ class Tracker:
         tracked = Tracked(frame, given, pose, covariance, bool(found.converged), fused)
         self.frames.append(tracked)
         if fused:
-            self._reference = tracked
+            self._fitting = [*self._fitting[-1:], tracked]
         return tracked.pose
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, open_regular, parsing, read_rows
-from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
+from hiosdf_jax._src.datasets.stream import FrameStream, check_has_poses
 from hiosdf_jax._src.numerics.intake import as_number, check_pose
 
 _INFO = ("replicaCAD_info.json", "cam_params.json")
@@ -45,8 +45,8 @@ def replicacad_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> 
     folder = Path(folder)
     images = numbered_files(folder / "results", r"depth(\d+)\.png")
     path = folder / "traj.txt"
-    if poses and not path.exists():
-        raise NoPosesError(f"{folder}: has no poses, expected them in {path.name}")
+    if poses:
+        check_has_poses(path, path.name)
     rows, lines = read_rows(path, 16) if poses else ((), ())
     matrix, scale, size = _camera(folder)
 

@@ -17,7 +17,7 @@ import numpy as np
 from hiosdf_jax._src.datasets.depth import read_depth
 from hiosdf_jax._src.datasets.files import numbered_files, read_rows
 from hiosdf_jax._src.datasets.sensors import check_camera
-from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
+from hiosdf_jax._src.datasets.stream import FrameStream, check_has_poses
 from hiosdf_jax._src.numerics.intake import check_pose
 
 _SCALE = 1000.0  # depth is in mm
@@ -47,8 +47,8 @@ def scannet_stream(folder: str | os.PathLike[str], *, poses: bool = True) -> Fra
     folder = Path(folder)
     images = numbered_files(folder / "depth", r"(\d+)\.png")
     _check_once(images)
-    if poses and not (folder / "pose").exists():
-        raise NoPosesError(f"{folder}: has no poses, expected them in the folder pose")
+    if poses:
+        check_has_poses(folder / "pose", "the folder pose")
     path = folder / "intrinsic" / "intrinsic_depth.txt"
     matrix = _matrix(path)[:3, :3]
     check_camera(f"{path}: camera matrix", matrix)

@@ -6,6 +6,7 @@ import numbers
 import os
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -70,6 +71,12 @@ class BadFrameError(ValueError):
 
 class NoPosesError(ValueError):
     """A recording has no poses. With `poses=False`, `open_stream` opens it nevertheless."""
+
+
+def check_has_poses(path: Path, name: str) -> None:
+    """Raises a NoPosesError, which calls it `name`, if a recording's file of poses is missing."""
+    if not path.exists():
+        raise NoPosesError(f"{path.parent}: has no poses, expected them in {name}")
 
 
 class FrameStream:

@@ -19,7 +19,7 @@ import numpy as np
 
 from hiosdf_jax._src.datasets.depth import pinhole, read_depth
 from hiosdf_jax._src.datasets.files import read_words
-from hiosdf_jax._src.datasets.stream import FrameStream, NoPosesError
+from hiosdf_jax._src.datasets.stream import FrameStream, check_has_poses
 from hiosdf_jax._src.datasets.timed_poses import pose_at, read_timed_poses
 
 _SCALE = 5000.0
@@ -70,8 +70,8 @@ def tum_stream(
     if not images:
         raise ValueError(f"{folder / 'depth.txt'}: has no image, expected at least one")
     path = folder / "groundtruth.txt"
-    if poses and not path.exists():
-        raise NoPosesError(f"{folder}: has no poses, expected them in {path.name}")
+    if poses:
+        check_has_poses(path, path.name)
     trajectory = read_timed_poses(path) if poses else None
     size = None
     if intrinsics is None:

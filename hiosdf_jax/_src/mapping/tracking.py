@@ -26,8 +26,8 @@ from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.flags import Flag
 from hiosdf_jax._src.state.pytrees import MapState, Report
 
-MOST_MOVED = 2.0
-"""How far a pose may be moved from its prediction, as a share of `reach_m`, m and rad."""
+# How far a pose may be moved from its prediction, as a share of `reach_m`, m and rad.
+_MOST_MOVED = 2.0
 
 # The standard deviation of a prediction without a prior, as a share of `reach_m`, m and rad.
 _PREDICTED_DEVIATION = 0.25
@@ -161,6 +161,11 @@ def prior_of_prediction(pose: Any, reach_m: jax.Array | float) -> tuple[Any, Any
     return pose, (_PREDICTED_DEVIATION * reach_m) ** 2 * jnp.eye(6, dtype=jnp.float32)
 
 
+def is_near(predicted: jax.Array, pose: jax.Array, reach_m: jax.Array | float) -> jax.Array:
+    """Returns whether `track` takes a pose (4, 4) that far from the predicted one (4, 4), ()."""
+    return jnp.maximum(*distance_and_angle(predicted, pose)) <= _MOST_MOVED * reach_m
+
+
 def _covariance_of(prior: tuple[Any, Any] | None) -> jax.Array | None:
     return None if prior is None else on_device("prior covariance", prior[1])
 
@@ -191,7 +196,7 @@ def _register(
 ) -> tuple[Registration, _Decision]:
     """Decides whether a cloud is fused, and where."""
     first = updates == 0
-    near = jnp.maximum(*distance_and_angle(predicted, found.pose)) <= MOST_MOVED * reach_m
+    near = is_near(predicted, found.pose, reach_m)
     registered = found.converged & near & ~first
     # A young map may have too few surfaces to register a cloud, and would never get more.
     fused = registered | (updates < CONFIDENT_UPDATES)
