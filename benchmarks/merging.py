@@ -1,14 +1,16 @@
 """Maps a stream in parts, joins the parts, and prints the errors beside those of one pass.
 
-    python -m benchmarks.merging ../shared/data/house_depth.npz --output merging.json
+    python -m benchmarks.merging ../shared/data/house_depth.npz
 
 The parts are two halves, the same with the second half in a frame of its own, and eight submaps of
-a trajectory that drifts by 20 cm and 2 degrees, of which the last poses close the loop.
+a trajectory that drifts by 20 cm and 2 degrees, of which the last poses close the loop. `--output`
+writes a record of the errors, and `--gate` compares them with the committed one.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import jax
@@ -16,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
-from benchmarks import records
+from benchmarks import pose_record
 from hiosdf_jax import datasets, scoring
 
 DRIFT_M, DRIFT_DEG = 0.20, 2.0
@@ -66,15 +68,15 @@ def score(name, state, truth, pose_map_world):
         return sdf, grad @ turn
 
     scores = scoring.evaluate(answer, truth)
-    row = {column: records.rounded(float(scores[column]), 4) for column in COLUMNS}
-    print(f"| {name} | " + " | ".join(f"{value:g}" for value in row.values()) + " |", flush=True)
+    row = {column: float(scores[column]) for column in COLUMNS}
+    print(f"| {name} | " + " | ".join(f"{value:.4g}" for value in row.values()) + " |", flush=True)
     return row
 
 
 def main():
     parser = argparse.ArgumentParser(description="Joins maps of parts of a stream.")
     parser.add_argument("stream", type=Path, help="a recording with exact distances")
-    parser.add_argument("--output", type=Path, help="record to write")
+    pose_record.add_options(parser)
     options = parser.parse_args()
     stream = datasets.open_stream(options.stream)
     truth = datasets.read_truth(options.stream)
@@ -112,10 +114,8 @@ def main():
         motions += [drift] * len(part)
     add("a loop with drift", map_frames(frames, wide, max_range, motions))
     add("the same, corrected", hio.correct(submaps, np.linalg.inv(drifts), bounds))
-    if options.output:
-        stream_name = options.stream.stem
-        records.write(options.output, {stream_name: rows, "provenance": records.provenance()})
+    return 1 if pose_record.finish(options, "merging", options.stream.stem, rows) else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -10,12 +10,14 @@ Without `--stream` the frames are those of the demo's camera. `--between` takes 
 its path instead, almost all between the frames of the map. `--occluded` puts a quarter of the
 returns at 0.55 of their range, as on a person, and the poses 10 cm and 4 degrees off. `--map` takes
 a saved map, made of all frames but the held-out ones, instead of making it. `--bake` refines by a
-baked field. `--hypotheses` times this many poses at once, and one pose inside `jit`.
+baked field. `--hypotheses` times this many poses at once, and one pose inside `jit`. `--output`
+writes a record of the errors, and `--gate` compares them with the committed one.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -26,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 import hiosdf_jax as hio
+from benchmarks import pose_record
 from hiosdf_jax import datasets, demo
 from hiosdf_jax._src.scoring.held_out import held_out_frames
 
@@ -33,6 +36,10 @@ CASES = ((0.0, 0.0), (0.05, 3.0), (0.15, 6.0))  # m, degrees
 OCCLUDED_CASE = 0.10, 4.0
 OCCLUDED_SHARE, OCCLUDED_RANGE = 0.25, 0.55
 FAR_CM = 3
+FIGURES = {  # and how many decimals are printed
+    **{"poses": 0, "median_cm": 2, "p95_cm": 2, "most_cm": 2, "median_deg": 3, "p95_deg": 3},
+    **{"normalized_square": 1, "converged": 0, "far": 0, "far_converged": 0, "ms": 1},
+}
 POINTS_OF_HYPOTHESES = 256
 REPEATS = 20
 
@@ -77,8 +84,8 @@ def make_map(stream, held_out, config_name):
     return state
 
 
-def print_case(field, frames, distance_m, angle_deg, tries):
-    """Refines perturbed poses of all frames and prints a row of the table."""
+def measure_case(field, frames, distance_m, angle_deg, tries):
+    """Refines perturbed poses of all frames; returns the figures of the errors that remain."""
     rng = np.random.default_rng(0)
     errors, squares, seconds, converged = [], [], [], []
     for cloud, pose in frames:
@@ -93,14 +100,19 @@ def print_case(field, frames, distance_m, angle_deg, tries):
             converged.append(bool(found.converged))
     distance, angle = np.transpose(errors)
     far = distance > FAR_CM
-    print(
-        f"| {100 * distance_m:g} cm, {angle_deg:g} deg | {len(distance)} | "
-        f"{np.median(distance):.2f} | {np.percentile(distance, 95):.2f} | {distance.max():.2f} | "
-        f"{np.median(angle):.3f} | {np.percentile(angle, 95):.3f} | {np.mean(squares):.1f} | "
-        f"{np.mean(converged):.2f} | {np.sum(~far)} | {np.sum(far & converged)} | "
-        f"{1e3 * np.median(seconds[1:]):.3g} |",
-        flush=True,
-    )
+    return {
+        "poses": len(distance),
+        "median_cm": np.median(distance),
+        "p95_cm": np.percentile(distance, 95),
+        "most_cm": distance.max(),
+        "median_deg": np.median(angle),
+        "p95_deg": np.percentile(angle, 95),
+        "normalized_square": np.mean(squares),
+        "converged": np.sum(converged),
+        "far": np.sum(far),
+        "far_converged": np.sum(far & converged),
+        "ms": 1e3 * np.median(seconds[1:]),
+    }
 
 
 def median_ms(function, arguments):
@@ -144,6 +156,7 @@ def main():
     parser.add_argument("--config", choices=("light", "default"), default="light")
     parser.add_argument("--bake", type=float, metavar="M", help="bake the map at this resolution")
     parser.add_argument("--hypotheses", type=int, default=0, help="poses to refine at once")
+    pose_record.add_options(parser)
     arguments = parser.parse_args()
     if arguments.between and arguments.stream:
         parser.error("--between is for the demo, without --stream")
@@ -163,13 +176,13 @@ def main():
     if arguments.occluded:
         rng = np.random.default_rng(2)
         frames = [(occlude(cloud, rng), pose) for cloud, pose in frames]
-    print("| off by | poses | median, cm | 95 %, cm | most, cm | median, deg | 95 %, deg |", end="")
-    print(
-        " normalized square, 6 expected | converged | within 3 cm | of the others converged | ms |"
-    )
-    print("| --- " * 12 + "|")
+    rows = {}
+    print("| off by | " + " | ".join(FIGURES) + " |\n" + "| --- " * (len(FIGURES) + 1) + "|")
     for distance_m, angle_deg in (OCCLUDED_CASE,) if arguments.occluded else CASES:
-        print_case(field, frames, distance_m, angle_deg, arguments.tries)
+        name = f"{100 * distance_m:g} cm, {angle_deg:g} degrees"
+        rows[name] = measure_case(field, frames, distance_m, angle_deg, arguments.tries)
+        cells = [f"{rows[name][figure]:.{digits}f}" for figure, digits in FIGURES.items()]
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
     rng = np.random.default_rng(1)
     foreign = [rng.uniform(-3, 3, (20_000, 3)).astype(np.float32), 0.6 * frames[0][0]]
     for cloud, name in zip(foreign, ("random points", "a view scaled by 0.6"), strict=True):
@@ -177,7 +190,12 @@ def main():
         print(f"{name}: converged {bool(found.converged)}, inliers {float(found.inliers):.2f}")
     if arguments.hypotheses:
         print_hypotheses(field, frames, arguments.hypotheses)
+    name = arguments.stream.stem if arguments.stream else "demo"
+    name += ", occluded" * arguments.occluded + f", {arguments.config}"
+    name += f", {arguments.between} poses" * bool(arguments.between)
+    name += f", baked at {arguments.bake} m" if arguments.bake else ""
+    return 1 if pose_record.finish(arguments, "refining", name, rows) else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

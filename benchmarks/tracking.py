@@ -21,26 +21,29 @@
 
 `--relocalize` searches random frames. `--mapped` maps only the first ones, and searches the others:
 some of them are at places that the map does not know. `--map` takes a saved map, for instance of
-another place. It prints how many right and wrong places have converged, and how many of these are
-sure: `score` exceeds `other_score` by more than 0.1.
+another place. It counts right places, wrong ones that have converged, and how many are `sure`.
 
 `--wrong-poses` refines each third frame from poses that are 0.5 and 1 m off, in the map before it.
 
 `--stream demo` is the apartment; 240 frames are 10 Hz at 1 m/s. `--kiss-icp` measures the odometry
-of KISS-ICP on the same clouds beside; it needs `pip install kiss-icp`.
+of KISS-ICP on the same clouds beside; it needs `pip install kiss-icp`. `--output` writes a record
+of the figures, and `--gate` compares them with the committed one.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 import hiosdf_jax as hio
+from benchmarks import pose_record
 from benchmarks.registration import error, perturb
 from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.stream_poses import Tracker
@@ -149,19 +152,20 @@ def map_again(frames, config, given, poses, refused):
     return state, list(poses), np.flatnonzero(~registered).tolist()
 
 
-def describe(poses, frames):
-    """Says how far poses are from the exact ones, which they share at the first frame."""
+def measure_poses(poses, frames):
+    """Returns how far poses are from the exact ones, which they share at the first frame."""
     away = np.stack([error(a, b) for a, (_, b) in zip(poses, frames, strict=True)])
-    way = 100 * np.linalg.norm(away[:, :3], axis=1)
-    angle = np.degrees(np.linalg.norm(away[:, 3:], axis=1))
-    return (
-        f"poses off by {np.sqrt(np.mean(way**2)):.2f} cm (root mean square), "
-        f"{way.max():.2f} cm (most), {way[-1]:.2f} cm and {angle[-1]:.2f} deg (end)"
-    )
+    distance_cm = 100 * np.linalg.norm(away[:, :3], axis=1)
+    return {
+        "rms_cm": np.sqrt(np.mean(distance_cm**2)),
+        "most_cm": distance_cm.max(),
+        "end_cm": distance_cm[-1],
+        "end_deg": np.degrees(np.linalg.norm(away[-1, 3:])),
+    }
 
 
-def print_kiss_icp(stream, frames, max_range):
-    """Prints the errors of KISS-ICP with its defaults for this range, without deskewing."""
+def measure_kiss_icp(frames, max_range):
+    """Returns the errors of KISS-ICP with its defaults for this range, without deskewing."""
     from kiss_icp.config import KISSConfig  # pyright: ignore[reportMissingImports]
     from kiss_icp.kiss_icp import KissICP  # pyright: ignore[reportMissingImports]
 
@@ -173,46 +177,52 @@ def print_kiss_icp(stream, frames, max_range):
         points = np.asarray(cloud[np.isfinite(cloud).all(axis=1)], np.float64)
         odometry.register_frame(points, np.zeros(len(points)))
         poses.append(frames[0][1] @ odometry.last_pose)
-    print(f"{stream}, KISS-ICP: {describe(poses, frames)}; {time.perf_counter() - begin:.0f} s")
+    return measure_poses(poses, frames) | {"seconds": time.perf_counter() - begin}
 
 
-def print_tracking(stream, frames, config, truth, mode, seed):
-    """Maps a stream and prints the errors of the poses and of the map."""
+def measure_tracking(frames, config, truth, mode, seed):
+    """Maps a stream; returns the errors of the poses and of the map."""
     begin = time.perf_counter()
     state, poses, refused = map_stream(frames, config, mode, seed)
-    print(f"{stream}, {mode}: {describe(poses, frames)}; not registered: {refused}; ", end="")
-    print(f"{time.perf_counter() - begin:.0f} s", flush=True)
+    row = measure_poses(poses, frames) | {"frames": len(frames), "not_registered": len(refused)}
+    if mode == "glitch":
+        row["fused_wrong"] = len(set(GLITCH) - set(refused))
+    row["seconds"] = time.perf_counter() - begin
     if truth is not None:
         queries = CompiledQueries(hio.snapshot(state))
         scores = scoring.evaluate(queries.sdf_and_grad, truth, last_frame=len(frames) - 1)
-        print(f"map error {scores['visible_cm']:.3f} cm")
+        row["map_cm"] = scores["visible_cm"]
+    return row
 
 
-def print_wrong_poses(stream, frames, config):
-    """Prints how many wrong poses pass as right ones, and how many right ones are refused."""
+def measure_wrong_poses(frames, config):
+    """Counts wrong poses that pass as right ones, and right ones that are refused."""
     state = hio.init(config, jax.random.key(0))
-    right = refused = 0
-    counts = {distance_m: np.zeros(3, int) for distance_m in SHIFTS_M}
-    for i, (cloud, pose) in enumerate(frames):
+    right = {"tried": 0, "refused": 0}
+    wrong = {
+        distance_m: {"tried": 0, "enough_inliers": 0, "taken": 0, "most_taken_m": 0.0}
+        for distance_m in SHIFTS_M
+    }
+    for i, (cloud, pose) in enumerate(tqdm(frames, "mapping", leave=False)):
         if i >= 6 and i % 3 == 0:
             found, near = _refine_from(state, cloud, pose)
-            right += 1
-            refused += not (near and bool(found.converged))
+            right["tried"] += 1
+            right["refused"] += not (near and bool(found.converged))
             for distance_m, shifts in SHIFTS_M.items():
+                row = wrong[distance_m]
                 for shift in shifts:
                     start = np.array(pose)
                     start[:3, 3] += shift
                     found, near = _refine_from(state, cloud, start)
-                    near &= np.linalg.norm(error(found.pose, pose)[:3]) >= WRONG_M
-                    fits = float(found.inliers) >= LEAST_INLIERS, bool(found.converged)
-                    counts[distance_m] += [True, near and fits[0], near and fits[1]]
+                    away_m = np.linalg.norm(error(found.pose, pose)[:3])
+                    near &= away_m >= WRONG_M
+                    row["tried"] += 1
+                    row["enough_inliers"] += near and float(found.inliers) >= LEAST_INLIERS
+                    if near and bool(found.converged):
+                        row["taken"] += 1
+                        row["most_taken_m"] = max(row["most_taken_m"], away_m)
         state = hio.update(state, cloud, pose)
-    for distance_m, (tried, by_inliers, taken) in counts.items():
-        print(
-            f"{stream}: of {tried} poses that were {distance_m:g} m off, {by_inliers} wrong ones "
-            f"have enough inliers, and {taken} are taken"
-        )
-    print(f"{stream}: of {right} right ones {refused} are refused")
+    return {"right": right} | {f"{distance_m:g} m off": row for distance_m, row in wrong.items()}
 
 
 def _refine_from(state, cloud, start):
@@ -222,10 +232,10 @@ def _refine_from(state, cloud, start):
     return found, bool(is_near(start, found.pose, GROWING_REACH_M))
 
 
-def print_relocalization(stream, frames, numbers, field, up_world):
-    """Finds frames in a map, and prints how many were found, and how sure the places are."""
+def measure_relocalization(frames, numbers, field, up_world):
+    """Finds frames in a map; counts how many were found, and how sure the places are."""
     rng, seconds, places = np.random.default_rng(0), [], []
-    for i in numbers:
+    for i in tqdm(numbers, "relocalizing", leave=False):
         cloud, pose = frames[i]
         # An accelerometer that is off by a degree.
         tilt = perturb(np.eye(4), rng, 0.0, 1.0)[:3, :3]
@@ -237,21 +247,29 @@ def print_relocalization(stream, frames, numbers, field, up_world):
         jax.block_until_ready(place)
         seconds.append(time.perf_counter() - begin)
         away = error(place.best.pose, pose)
-        way, angle = np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))
-        right, score, other = way < FOUND[0] and angle < FOUND[1], place.score, place.other_score
+        distance_m, angle = np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))
+        right = distance_m < FOUND[0] and angle < FOUND[1]
         places.append([right, bool(place.best.converged), bool(place.sure)])
         if not right:
-            print(
-                f"frame {i}: {way:.2f} m and {angle:.1f} deg off, score {float(score):.2f}, "
-                f"other {float(other):.2f}"
-            )
+            scores = f"score {float(place.score):.2f}, other {float(place.other_score):.2f}"
+            print(f"frame {i}: {distance_m:.2f} m and {angle:.1f} deg off, {scores}")
     places = np.array(places)
     right, wrong = places[places[:, 0]], places[~places[:, 0]]
-    print(
-        f"{stream}: {len(right)} of {len(places)} found, {right[:, 1].sum()} of them converged and "
-        f"{right[:, 2].sum()} sure; of {len(wrong)} wrong places {wrong[:, 1].sum()} converged and "
-        f"{wrong[:, 2].sum()} sure; {np.median(seconds[1:]):.2f} s each (median)"
-    )
+    return {
+        "tried": len(places),
+        "found": len(right),
+        "sure": right[:, 2].sum(),
+        "wrong": len(wrong),
+        "wrong_converged": wrong[:, 1].sum(),
+        "wrong_sure": wrong[:, 2].sum(),
+        "seconds": np.median(seconds[1:]),
+    }
+
+
+def print_row(stream, name, row):
+    """Prints the figures of a row on one line."""
+    figures = ", ".join(f"{figure} {float(value):.4g}" for figure, value in row.items())
+    print(f"{stream}, {name}: {figures}", flush=True)
 
 
 def main():
@@ -268,6 +286,7 @@ def main():
         "--frames", type=int, help="use only the first ones; the demo has this many"
     )
     parser.add_argument("--kiss-icp", action="store_true", help="measure KISS-ICP, too")
+    pose_record.add_options(parser)
     arguments = parser.parse_args()
     if is_demo := str(arguments.stream) == "demo":
         stream = demo.ApartmentStream(arguments.frames or 240)
@@ -282,13 +301,21 @@ def main():
     if arguments.order:
         order = np.random.default_rng(arguments.order)
         frames = [(order.permutation(cloud), pose) for cloud, pose in frames]
-    name = arguments.stream.stem
+    name, worse = arguments.stream.stem, 0
+    tracked = {}
     for mode in arguments.poses:
-        print_tracking(name, frames, config, truth, mode, arguments.seed)
+        label = f"{mode}, seed {arguments.seed}" if mode.startswith("jitter") else mode
+        tracked[label] = measure_tracking(frames, config, truth, mode, arguments.seed)
+        print_row(name, label, tracked[label])
     if arguments.kiss_icp:
-        print_kiss_icp(name, frames, max_range)
+        tracked["KISS-ICP"] = measure_kiss_icp(frames, max_range)
+        print_row(name, "KISS-ICP", tracked["KISS-ICP"])
+    worse += pose_record.finish(arguments, "tracking", name, tracked)
     if arguments.wrong_poses:
-        print_wrong_poses(name, frames, config)
+        rows = measure_wrong_poses(frames, config)
+        for label, row in rows.items():
+            print_row(name, label, row)
+        worse += pose_record.finish(arguments, "wrong poses", name, rows)
     if arguments.relocalize:
         if arguments.map:
             state = hio.load(arguments.map)
@@ -302,8 +329,16 @@ def main():
         first = arguments.mapped or 0
         others = first + np.random.default_rng(0).permutation(len(frames) - first)
         numbers = others[: arguments.relocalize].tolist()
-        print_relocalization(name, frames, numbers, hio.snapshot(state), up_world)
+        row = measure_relocalization(frames, numbers, hio.snapshot(state), up_world)
+        where = "its own map"
+        if arguments.map:
+            where = f"the map {arguments.map.stem}"
+        elif arguments.mapped:
+            where = f"the map of {arguments.mapped} frames"
+        print_row(name, where, row)
+        worse += pose_record.finish(arguments, "places", name, {where: row})
+    return 1 if worse else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
