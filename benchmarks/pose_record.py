@@ -8,6 +8,7 @@ processor and with every change of code, since rounding decides which of two nea
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from benchmarks import records
 
 RECORD = records.RESULTS / "registration.json"
 
-Rows = dict[str, dict[str, float]]  # {row: {figure: value}}
+Rows = Mapping[str, Mapping[str, Any]]  # {row: {figure: value}}
 
 # What a figure may be, as a factor of the record's and an addend. Other figures are not compared.
 _LIMITS = {
@@ -96,7 +97,7 @@ def keep(path: Path, part: str, stream: str, rows: Rows) -> None:
         row: {figure: records.rounded(float(value), 4) for figure, value in measured.items()}
         for row, measured in rows.items()
     }
-    streams[stream] = records.provenance() | {"rows": older | figures}
+    streams[stream] = records.provenance() | {"rows": {**older, **figures}}
     records.write(path, record)
 
 

@@ -142,6 +142,64 @@ def test_scan_and_one_frame_after_another_agree(sharp_map):
     assert int(after.report.flags) == int(state.report.flags)
 
 
+ARM_SENSOR = np.array([[0.3, 0.05, 0.0], [0.42, 0.05, 0.05]])  # m
+ARM_RADII = np.array([0.06, 0.05], np.float32)
+
+
+def frame_with_an_arm(share):
+    """A frame of which a share of the returns is on the robot's own arm, their mask, the robot."""
+    cloud, pose, predicted = frame()
+    on_arm = np.arange(COUNT) < share * COUNT
+    rng = np.random.default_rng(1)
+    offsets = rng.normal(size=(COUNT, 3))
+    offsets *= 1.1 * ARM_RADII[0] / np.linalg.norm(offsets, axis=1, keepdims=True)
+    covered = np.where(on_arm[:, None], ARM_SENSOR[0] + offsets, cloud).astype(np.float32)
+    centers = ARM_SENSOR @ predicted[:3, :3].T + predicted[:3, 3]
+    return covered, on_arm, pose, predicted, (centers.astype(np.float32), ARM_RADII)
+
+
+def test_returns_on_the_robot_neither_register_nor_map(sharp_map):
+    covered, on_arm, pose, predicted, robot = frame_with_an_arm(0.5)
+    _, misled = hio.track(sharp_map, covered, predicted)
+    assert not bool(misled.converged)
+    state, found = hio.track(sharp_map, covered, predicted, robot=robot)
+    assert bool(found.converged)
+    assert np.linalg.norm(np.asarray(found.pose)[:3, 3] - pose[:3, 3]) < 0.01
+    without = np.where(on_arm[:, None], np.nan, covered)
+    away = robot[0] + 50, robot[1]
+    expected, alone = hio.track(sharp_map, without, predicted, robot=away)
+    for part, other in zip(found, alone, strict=True):
+        np.testing.assert_array_equal(part, other)
+    assert arrays_equal(state.grid, expected.grid)
+    # Inside jit the same functions are nested.
+    _, traced = jax.eval_shape(hio.track, sharp_map, covered, predicted, robot=robot)
+    assert traced.pose.shape == (4, 4)
+
+
+def test_the_robot_moves_with_the_pose(sharp_map):
+    """The prediction is so far off that spheres that stay there do not cover the arm."""
+    covered, _, pose, _, _ = frame_with_an_arm(0.2)
+    predicted = moved(pose, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+    centers = (ARM_SENSOR @ predicted[:3, :3].T + predicted[:3, 3]).astype(np.float32)
+    state, found = hio.track(sharp_map, covered, predicted, robot=(centers, ARM_RADII))
+    assert bool(found.converged)
+    arm_world = ARM_SENSOR @ np.asarray(found.pose)[:3, :3].T + np.asarray(found.pose)[:3, 3]
+    right = (arm_world.astype(np.float32), ARM_RADII)
+    used = int(hio.update(sharp_map, covered, found.pose, robot=right).report.points_used)
+    assert int(state.report.points_used) == used < COUNT
+    stayed = hio.update(sharp_map, covered, found.pose, robot=(centers, ARM_RADII))
+    assert int(stayed.report.points_used) > used
+    assert float(hio.sdf(state, arm_world[0])) > 0.1
+
+
+def test_a_view_of_the_robot_alone_is_not_registered(sharp_map):
+    covered, _, _, predicted, robot = frame_with_an_arm(1.0)
+    state, found = hio.track(sharp_map, covered, predicted, robot=robot)
+    assert not bool(found.converged)
+    assert hio.Flag.NOT_REGISTERED in hio.Flag(state.report.update_flags)
+    assert int(state.updates) == int(sharp_map.updates)
+
+
 @pytest.mark.long
 def test_a_stack_of_maps_is_traced_by_vmap(empty_map):
     cloud, _, predicted = frame()
@@ -203,6 +261,11 @@ def test_wrong_input_is_named(empty_map):
     ]:
         with pytest.raises(ValueError, match=message):
             hio.track(*arguments)
+    with pytest.raises(ValueError, match="robot has centers of shape"):
+        hio.track(empty_map, cloud, pose, robot=(np.zeros((2, 3)), np.zeros(3)))
+    robot = np.zeros((2, 3)), np.zeros(2)
+    with pytest.raises(ValueError, match="prior has a mean of shape"):
+        hio.track(empty_map, cloud, pose, (np.eye(3), np.eye(6)), robot=robot)
     with pytest.raises(ValueError, match=r"reach_m is 0, expected >= 0\.001"):
         hio.track(empty_map, cloud, pose, reach_m=0)
     with pytest.raises(ValueError, match="before: pose is not rigid"):

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
+from hiosdf_jax._src.grid import rays
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.equations import UNKNOWN_M
 from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
+    checked_prior,
     checked_reach,
     refine_pose,
 )
@@ -40,6 +42,7 @@ def track(
     prior: tuple[Any, Any] | None = None,
     *,
     donate: bool = False,
+    robot: tuple[Any, Any] | None = None,
     noise: tuple[Any, Any] | None = None,
     reach_m: Any = GROWING_REACH_M,
 ) -> tuple[MapState, Registration]:
@@ -59,6 +62,8 @@ def track(
         prior: As for `refine_pose`. By default the predicted pose, with a standard deviation of a
             quarter of `reach_m`: 5 cm and 2.9 degrees.
         donate: As for `update`.
+        robot: As for `update`, with the centers where the predicted pose puts them. Returns on the
+            robot do not count for the registration, and the spheres move with the pose.
         noise: As for `update`.
         reach_m: As for `refine_pose`. A pose that is farther than twice this from the prediction,
             m or rad, is refused.
@@ -82,9 +87,9 @@ def track(
         ...         last, reference = found, i
     """
     check_map(state, batched="jax.vmap(hio.track)(maps, clouds, poses)")
-    _, checked_noise = check_extras(None, noise)
+    checked_robot, checked_noise = check_extras(robot, noise)
     reach = checked_reach(reach_m)
-    traced = is_traced(*jax.tree.leaves((state, prior, checked_noise, reach)))
+    traced = is_traced(*jax.tree.leaves((state, prior, checked_robot, checked_noise, reach)))
     traced = traced or is_traced(cloud, predicted_pose)
     if traced:
         cloud, pose = as_traced(cloud, predicted_pose)
@@ -93,10 +98,17 @@ def track(
         padded, pose = check_and_pad(cloud, predicted_pose, state.config.max_points)
         fused_cloud, start = jax.device_put((padded, pose))
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
-    found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
+    if checked_robot is None:
+        found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
+    else:
+        checked_prior(prior)
+        refine = _refine_beside_robot if traced else _refine_beside_robot_jit
+        found = refine(state, fused_cloud, start, chosen, checked_robot, checked_noise, reach)
     own = _covariance_of(prior)
     found, decision = _register_jit(state.updates, start, found, own, reach)
-    extras, donate = (None, checked_noise), donate and not traced
+    if checked_robot is not None:
+        checked_robot = _move_robot_jit(checked_robot, start, found.pose, decision.registered)
+    extras, donate = (checked_robot, checked_noise), donate and not traced
     state = run_update(state, fused_cloud, found.pose, extras, decision.flags, donate)
     # `update` may refuse what a young map takes on trust.
     report, converged, covariance = _confirm_jit(found, decision, state.report, state.updates, own)
@@ -164,6 +176,44 @@ def prior_of_prediction(pose: Any, reach_m: jax.Array | float) -> tuple[Any, Any
 def is_near(predicted: jax.Array, pose: jax.Array, reach_m: jax.Array | float) -> jax.Array:
     """Returns whether `track` takes a pose (4, 4) that far from the predicted one (4, 4), ()."""
     return jnp.maximum(*distance_and_angle(predicted, pose)) <= _MOST_MOVED * reach_m
+
+
+@plain
+def _refine_beside_robot(
+    state: MapState,
+    cloud: jax.Array,
+    predicted: jax.Array,
+    prior: tuple[Any, Any],
+    robot: tuple[jax.Array, jax.Array],
+    noise: Any,
+    reach_m: jax.Array,
+) -> Registration:
+    """Refines a pose by the returns that are not on the robot."""
+    finite = jnp.all(jnp.isfinite(cloud), axis=-1)
+    placed = rays.place_cloud(state.config, cloud, finite, predicted, noise)
+    others = rays.remove_robot(placed, *robot).in_range
+    cloud = jnp.where(others[:, None], cloud, jnp.nan)
+    return refine_pose(state, cloud, predicted, prior, noise=noise, reach_m=reach_m)
+
+
+_refine_beside_robot_jit = jax.jit(_refine_beside_robot)
+
+
+@plain
+def _move_robot(
+    robot: tuple[jax.Array, jax.Array],
+    predicted: jax.Array,
+    pose: jax.Array,
+    registered: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Moves spheres from where they are seen from the predicted pose to where they are."""
+    centers, radii = robot
+    turn = jnp.matmul(pose[:3, :3], predicted[:3, :3].T, precision="highest")
+    offsets = jnp.matmul(centers - predicted[:3, 3], turn.T, precision="highest")
+    return jnp.where(registered, pose[:3, 3] + offsets, centers), radii
+
+
+_move_robot_jit = jax.jit(_move_robot)
 
 
 def _covariance_of(prior: tuple[Any, Any] | None) -> jax.Array | None:
