@@ -1,8 +1,8 @@
 """The committed record of refined poses, tracked streams, found places and merged maps.
 
-The record has {part: {stream: {"device", "jax", "revision", "rows": {row: {figure: value}}}}}. The
-gate calls a figure worse if it has grown by more than `_LIMITS` allow. Figures vary with the
-processor and with every change of code, since rounding decides which of two near minima is found.
+The record has {part: {stream: {row: {figure: value, "device", "jax", "revision"}}}}. The gate calls
+a figure worse if it has moved the wrong way by more than `_MOST` or `_LEAST` allow. Figures vary
+with the processor and the code, since rounding decides which of two near minima is found.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ RECORD = records.RESULTS / "registration.json"
 Rows = Mapping[str, Mapping[str, Any]]  # {row: {figure: value}}
 
 # What a figure may be, as a factor of the record's and an addend. Other figures are not compared.
-_LIMITS = {
+_MOST = {
     "median_cm": (1.15, 0.03),
     "p95_cm": (1.15, 0.05),
     "median_deg": (1.15, 0.01),
@@ -27,6 +27,7 @@ _LIMITS = {
     "normalized_square": (1.2, 0.5),
     "far": (1.0, 1),
     "far_converged": (1.0, 1),
+    "not_registered": (1.0, 2),
     "rms_cm": (1.3, 0.1),
     "end_cm": (1.5, 0.3),
     "map_cm": (1.2, 0.03),
@@ -37,9 +38,11 @@ _LIMITS = {
     "wrong_converged": (1.0, 1),
     "wrong_sure": (1.0, 0),
     "visible_cm": (1.1, 0.02),
+    "fpr": (1.2, 0.001),
 }
+_LEAST = {"converged": (1.0, -1), "sure": (0.9, -2), "recall": (1.0, -0.005)}
 
-# Rows whose errors vary by half between runs.
+# Errors of these rows vary by half between runs: only the wrong frames that they fuse are compared.
 _VARYING = ("jitter", "glitch", "glitch left out")
 
 
@@ -67,18 +70,18 @@ def finish(options: argparse.Namespace, part: str, stream: str, rows: Rows) -> i
         rows: The measured figures.
 
     Returns:
-        How many figures are worse; 0 without `--gate`.
+        How many figures are worse, or 1 if the record has none of the rows; 0 without `--gate`.
     """
+    committed = records.read(RECORD).get(part, {}).get(stream, {})
     if options.output and rows:
         keep(options.output, part, stream, rows)
-    if not options.gate:
+    if not (options.gate and rows):
         return 0
-    committed = records.read(RECORD).get(part, {}).get(stream, {}).get("rows", {})
     worse, compared = compare(committed, rows)
     for line in worse:
         print(f"WORSE {part}, {stream}, {line}")
     print(f"gate of {part}, {stream}: {compared} figures compared, {len(worse)} worse", flush=True)
-    return len(worse)
+    return len(worse) if rows.keys() & committed.keys() else 1
 
 
 def keep(path: Path, part: str, stream: str, rows: Rows) -> None:
@@ -91,13 +94,10 @@ def keep(path: Path, part: str, stream: str, rows: Rows) -> None:
         rows: The measured figures.
     """
     record: dict[str, Any] = records.read(path)
-    streams = record.setdefault(part, {})
-    older = streams.get(stream, {}).get("rows", {})
-    figures = {
-        row: {figure: records.rounded(float(value), 4) for figure, value in measured.items()}
-        for row, measured in rows.items()
-    }
-    streams[stream] = records.provenance() | {"rows": {**older, **figures}}
+    kept = record.setdefault(part, {}).setdefault(stream, {})
+    for row, figures in rows.items():
+        rounded = {figure: records.rounded(float(value), 4) for figure, value in figures.items()}
+        kept[row] = rounded | records.provenance()
     records.write(path, record)
 
 
@@ -113,13 +113,15 @@ def compare(committed: Rows, rows: Rows) -> tuple[list[str], int]:
     """
     worse, compared = [], 0
     for row in rows.keys() & committed.keys():
-        if row.split(", seed")[0] in _VARYING:
-            continue
-        for figure, (factor, addend) in _LIMITS.items():
-            if figure not in committed[row] or figure not in rows[row]:
+        old, new = committed[row], rows[row]
+        varies = row.split(", seed")[0] in _VARYING
+        for figure in ("fused_wrong",) if varies else (*_MOST, *_LEAST):
+            if figure not in old or figure not in new:
                 continue
-            old, new = committed[row][figure], rows[row][figure]
             compared += 1
-            if not new <= factor * old + addend:  # True for NaN
-                worse.append(f"{row}: {figure} {old:g} -> {new:g}")
+            factor, addend = (_MOST | _LEAST)[figure]
+            limit = factor * old[figure] + addend
+            holds = new[figure] >= limit if figure in _LEAST else new[figure] <= limit
+            if not holds:  # also for NaN
+                worse.append(f"{row}: {figure} {old[figure]:g} -> {new[figure]:g}")
     return sorted(worse), compared

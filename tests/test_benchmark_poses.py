@@ -31,6 +31,14 @@ def test_rows_that_vary_by_half_are_not_compared():
     new = {"jitter, seed 0": {"map_cm": 1.7}, "jitter smoothed, seed 0": {"map_cm": 0.9}}
     worse, compared = pose_record.compare(old, new)
     assert worse == ["jitter smoothed, seed 0: map_cm 0.6 -> 0.9"] and compared == 1
+    none, one = {"glitch": {"fused_wrong": 0}}, {"glitch": {"fused_wrong": 1}}
+    assert pose_record.compare(none, one)[0] == ["glitch: fused_wrong 0 -> 1"]
+
+
+def test_counts_that_should_be_high_are_compared_from_below():
+    old = {"its own map": {"sure": 68, "recall": 0.99}}
+    assert pose_record.compare(old, {"its own map": {"sure": 60, "recall": 0.986}})[0] == []
+    assert len(pose_record.compare(old, {"its own map": {"sure": 30, "recall": 0.5}})[0]) == 2
 
 
 def test_rows_are_kept_and_compared_by_the_options(tmp_path, monkeypatch, capsys):
@@ -40,12 +48,15 @@ def test_rows_are_kept_and_compared_by_the_options(tmp_path, monkeypatch, capsys
     assert pose_record.finish(options, "refining", "room", GOOD) == 0
     assert pose_record.finish(options, "refining", "room", {"exact": {"p95_cm": 0.123456}}) == 0
     kept = records.read(path)["refining"]["room"]
-    assert kept["rows"] == GOOD | {"exact": {"p95_cm": 0.1235}} and kept["device"] == "cpu"
+    measured = GOOD | {"exact": {"p95_cm": 0.1235}}
+    assert kept == {row: figures | records.provenance() for row, figures in measured.items()}
     gate = Namespace(output=None, gate=True)
     assert pose_record.finish(gate, "refining", "room", GOOD) == 0
     assert pose_record.finish(gate, "refining", "room", {"exact": {"p95_cm": 1.0}}) == 1
     assert "1 figures compared, 1 worse" in capsys.readouterr().out
-    assert pose_record.finish(gate, "refining", "elsewhere", GOOD) == 0
+    assert pose_record.finish(gate, "refining", "elsewhere", GOOD) == 1  # nothing to compare with
+    both = Namespace(output=path, gate=True)  # the gate reads the record before it is written
+    assert pose_record.finish(both, "refining", "room", {"exact": {"p95_cm": 1.0}}) == 1
 
 
 @pytest.fixture

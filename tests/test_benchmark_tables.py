@@ -9,7 +9,7 @@ import pytest
 from benchmarks import records
 from benchmarks.accuracy import results
 from benchmarks.tables import __main__ as command
-from benchmarks.tables import accuracy, markdown, speed
+from benchmarks.tables import accuracy, markdown, registration, speed
 
 RECORDS = sorted(records.RESULTS.glob("*.json"))
 
@@ -55,6 +55,21 @@ def test_cells_are_the_records_figures():
     assert cells[3:] == [
         f"{mean['visible_cm']:.2f}",
         f"{mean['recall']:.3f} / {mean['fpr']:.3f} |",
+    ]
+    record = json.loads((records.RESULTS / "registration.json").read_text())
+    row = record["refining"]["house_lidar, light"]["15 cm, 6 degrees"]
+    cells = registration.refining().splitlines()[2 + 5].split(" | ")
+    assert cells[1] == "15 cm and 6 degrees off"
+    assert cells[4] == f"{row['p95_cm']:.2f} cm, {row['p95_deg']:.3f}°"
+    error = record["merging"]["house_depth"]["one pass"]["visible_cm"]
+    assert registration.merging().splitlines()[2].split(" | ")[1] == f"{error:.2f}"
+    row = record["wrong poses"]["kitchen_depth"]["0.5 m off"]
+    line = next(line for line in registration.wrong_poses().splitlines() if "kitchen" in line)
+    assert line.split(" | ")[-1] == f"{row['taken']:.0f} |"
+    row = record["places"]["hall_lidar"]["89 in its own map"]
+    assert registration.places().splitlines()[-1].split(" | ")[2:4] == [
+        f"{row['found']:.0f}",
+        f"{row['sure']:.0f}",
     ]
     record = json.loads((records.RESULTS / "speed_gpu.json").read_text())
     times = {row["name"]: row for row in record["rows"]}

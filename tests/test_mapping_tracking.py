@@ -171,9 +171,16 @@ def test_returns_on_the_robot_neither_register_nor_map(sharp_map):
     for part, other in zip(found, alone, strict=True):
         np.testing.assert_array_equal(part, other)
     assert arrays_equal(state.grid, expected.grid)
-    # Inside jit the same functions are nested.
-    _, traced = jax.eval_shape(hio.track, sharp_map, covered, predicted, robot=robot)
-    assert traced.pose.shape == (4, 4)
+
+
+@pytest.mark.long
+def test_a_robot_inside_jit(sharp_map):
+    covered, _, _, predicted, robot = frame_with_an_arm(0.5)
+    state, found = hio.track(sharp_map, covered, predicted, robot=robot)
+    after, jitted = jax.jit(hio.track)(sharp_map, covered, predicted, robot=robot)
+    assert bool(jitted.converged)
+    np.testing.assert_allclose(jitted.pose, found.pose, atol=1e-3)
+    assert int(after.report.points_used) == int(state.report.points_used)
 
 
 def test_the_robot_moves_with_the_pose(sharp_map):

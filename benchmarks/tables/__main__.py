@@ -8,10 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import records
-from benchmarks.tables import accuracy, planning, provenance, speed
+from benchmarks.tables import accuracy, planning, provenance, registration, speed
 from benchmarks.tables.markdown import Tables, render
 
-TABLES: Tables = accuracy.TABLES | speed.TABLES | planning.TABLES | provenance.TABLES
+TABLES: Tables = {
+    **accuracy.TABLES,
+    **speed.TABLES,
+    **planning.TABLES,
+    **registration.TABLES,
+    **provenance.TABLES,
+}
 
 _FOLDERS = (".", "docs", "benchmarks", "benchmarks/results")
 

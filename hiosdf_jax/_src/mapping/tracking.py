@@ -62,8 +62,8 @@ def track(
         prior: As for `refine_pose`. By default the predicted pose, with a standard deviation of a
             quarter of `reach_m`: 5 cm and 2.9 degrees.
         donate: As for `update`.
-        robot: As for `update`, with the centers where the predicted pose puts them. Returns on the
-            robot do not count for the registration, and the spheres move with the pose.
+        robot: (centers, radii) as for `update`, with the centers placed by `predicted_pose`.
+            Returns on the robot do not count for the registration. The spheres move with the pose.
         noise: As for `update`.
         reach_m: As for `refine_pose`. A pose that is farther than twice this from the prediction,
             m or rad, is refused.
@@ -101,8 +101,8 @@ def track(
     if checked_robot is None:
         found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
     else:
-        checked_prior(prior)
-        refine = _refine_beside_robot if traced else _refine_beside_robot_jit
+        checked_prior(prior)  # inside jit only shapes would be checked
+        refine = _refine_without_robot if traced else _refine_without_robot_jit
         found = refine(state, fused_cloud, start, chosen, checked_robot, checked_noise, reach)
     own = _covariance_of(prior)
     found, decision = _register_jit(state.updates, start, found, own, reach)
@@ -179,7 +179,7 @@ def is_near(predicted: jax.Array, pose: jax.Array, reach_m: jax.Array | float) -
 
 
 @plain
-def _refine_beside_robot(
+def _refine_without_robot(
     state: MapState,
     cloud: jax.Array,
     predicted: jax.Array,
@@ -196,7 +196,7 @@ def _refine_beside_robot(
     return refine_pose(state, cloud, predicted, prior, noise=noise, reach_m=reach_m)
 
 
-_refine_beside_robot_jit = jax.jit(_refine_beside_robot)
+_refine_without_robot_jit = jax.jit(_refine_without_robot)
 
 
 @plain
