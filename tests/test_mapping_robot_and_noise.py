@@ -101,6 +101,24 @@ def test_the_margin_is_three_standard_deviations_of_a_noisy_return():
             assert (np.asarray(left.in_range) == (not found)).all()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_host_finds_the_same_returns_on_the_robot(seed):
+    rng = np.random.default_rng(seed)
+    cloud = rng.normal(size=(400, 3)).astype(np.float32)
+    cloud[:20, seed % 3] = np.nan
+    finite = np.isfinite(cloud).all(axis=1)
+    pose = room_cloud(seed)[1]
+    centers, radii = rng.normal(size=(4, 3)).astype(np.float32), rng.uniform(0.4, 0.9, 4)
+    noise = np.array([0.01, 0.02], np.float32)
+    placed = rays.place_cloud(CONFIG, cloud, finite, pose, jnp.asarray(noise))
+    left = rays.remove_robot(placed, jnp.asarray(centers), jnp.asarray(radii, jnp.float32))
+    expected = np.asarray(placed.in_range & ~left.in_range)
+    found = rays.is_on_robot_on_host(cloud, pose, centers, radii, noise)
+    assert 20 < expected.sum() < 360
+    np.testing.assert_array_equal(found[np.asarray(placed.in_range)], expected[placed.in_range])
+    assert not found[:20].any()
+
+
 def test_no_spheres_are_no_robot(empty_map):
     cloud, pose = room_cloud(0)
     nothing = (np.zeros((0, 3)), np.zeros(0))

@@ -183,6 +183,29 @@ def test_a_robot_inside_jit(sharp_map):
     assert int(after.report.points_used) == int(state.report.points_used)
 
 
+@pytest.mark.parametrize("wrong", [np.nan, -1.0, 6.0])
+@pytest.mark.long
+def test_inside_jit_a_robot_of_wrong_radii_registers_nothing(sharp_map, wrong):
+    cloud, _, predicted = frame()
+    robot = np.full((2, 3), 50, np.float32), np.full(2, wrong, np.float32)
+    state, found = jax.jit(hio.track)(sharp_map, cloud, predicted, robot=robot)
+    assert not bool(found.converged)
+    assert hio.Flag.BAD_ARGUMENT in hio.Flag(state.report.update_flags)
+    assert int(state.updates) == int(sharp_map.updates)
+
+
+def test_few_returns_beside_the_robot_are_not_drawn_away(sharp_map):
+    """A cloud that is larger than `max_points`, and nearly all of it on the arm."""
+    cloud, pose = room_cloud(100, 20 * COUNT, 0.3, (0.1, 0.05, 0.0))
+    predicted = moved(pose, [0.02, -0.015, 0.01], [0.01, 0.0, -0.02])
+    cloud[: int(19.5 * COUNT)] = ARM_SENSOR[0]
+    centers = ARM_SENSOR @ predicted[:3, :3].T + predicted[:3, 3]
+    state, found = hio.track(sharp_map, cloud, predicted, robot=(centers, ARM_RADII))
+    assert bool(found.converged)
+    assert np.linalg.norm(np.asarray(found.pose)[:3, 3] - pose[:3, 3]) < 0.002
+    assert int(state.report.points_used) > 0.3 * COUNT
+
+
 def test_the_robot_moves_with_the_pose(sharp_map):
     """The prediction is so far off that spheres that stay there do not cover the arm."""
     covered, _, pose, _, _ = frame_with_an_arm(0.2)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
@@ -109,3 +110,36 @@ def remove_robot(rays: Rays, centers_world: jax.Array, radii: jax.Array) -> Rays
     start = varying_like(jnp.zeros(rays.ends.shape, bool), rays, centers_world, radii)
     found, _ = jax.lax.scan(add, start, (centers_world, radii))
     return rays._replace(in_range=rays.in_range & ~found, ends=rays.ends & ~found)
+
+
+def is_on_robot_on_host(
+    cloud: np.ndarray,
+    pose: np.ndarray,
+    centers_world: np.ndarray,
+    radii: np.ndarray,
+    noise: np.ndarray,
+) -> np.ndarray:
+    """Returns which rows `remove_robot` removes, without the device.
+
+    Args:
+        cloud: (N, 3) float32 m, sensor frame.
+        pose: (4, 4) T_world_sensor.
+        centers_world: Centers of the robot's spheres, (K, 3) m.
+        radii: Their radii, (K,) m.
+        noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m.
+
+    Returns:
+        (N,) bool; False for rows with a NaN or inf.
+    """
+    centers = (centers_world - pose[:3, 3]) @ pose[:3, :3]
+    squares = np.einsum("ij,ij->i", cloud, cloud)
+    margin = np.maximum(_ROBOT_MARGIN_M, _ROBOT_MARGIN_SIGMAS * (noise[0] + noise[1] * squares))
+    reach = (np.linalg.norm(centers, axis=1) + radii).max()
+    near = np.flatnonzero(squares <= (reach + margin) ** 2)  # most returns are beyond the robot
+    on_robot = np.zeros(len(near), bool)
+    for center, radius in zip(centers, radii, strict=True):
+        offsets = cloud[near] - center
+        on_robot |= np.einsum("ij,ij->i", offsets, offsets) <= (radius + margin[near]) ** 2
+    found = np.zeros(len(cloud), bool)
+    found[near] = on_robot
+    return found

@@ -16,14 +16,19 @@ from hiosdf_jax._src.mapping.registration.equations import UNKNOWN_M
 from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
-    checked_prior,
     checked_reach,
     refine_pose,
 )
 from hiosdf_jax._src.numerics.arrays import on_device
-from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_traced
+from hiosdf_jax._src.numerics.intake import (
+    as_array,
+    as_traced,
+    check_pose,
+    cloud_and_returns,
+    is_traced,
+)
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.numerics.robot_and_noise import check_extras
+from hiosdf_jax._src.numerics.robot_and_noise import check_extras, extras_are_valid
 from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.flags import Flag
 from hiosdf_jax._src.state.pytrees import MapState, Report
@@ -91,19 +96,24 @@ def track(
     reach = checked_reach(reach_m)
     traced = is_traced(*jax.tree.leaves((state, prior, checked_robot, checked_noise, reach)))
     traced = traced or is_traced(cloud, predicted_pose)
+    only_robot = False
     if traced:
         cloud, pose = as_traced(cloud, predicted_pose)
         fused_cloud, start = cloud, pose
+        if checked_robot is not None:
+            cloud = _leave_out_robot(state, cloud, pose, checked_robot, checked_noise)
     else:
+        if checked_robot is not None:
+            # Before rows are drawn: few of them may be off the robot.
+            cloud, only_robot = _leave_out_robot_on_host(
+                state, cloud, predicted_pose, checked_robot, checked_noise
+            )
         padded, pose = check_and_pad(cloud, predicted_pose, state.config.max_points)
         fused_cloud, start = jax.device_put((padded, pose))
     chosen = prior_of_prediction(pose, reach) if prior is None else prior
-    if checked_robot is None:
-        found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
-    else:
-        checked_prior(prior)  # inside jit only shapes would be checked
-        refine = _refine_without_robot if traced else _refine_without_robot_jit
-        found = refine(state, fused_cloud, start, chosen, checked_robot, checked_noise, reach)
+    found = refine_pose(state, cloud, pose, chosen, noise=noise, reach_m=reach_m)
+    if only_robot:
+        found = found._replace(converged=jnp.asarray(False))
     own = _covariance_of(prior)
     found, decision = _register_jit(state.updates, start, found, own, reach)
     if checked_robot is not None:
@@ -179,24 +189,38 @@ def is_near(predicted: jax.Array, pose: jax.Array, reach_m: jax.Array | float) -
 
 
 @plain
-def _refine_without_robot(
+def _leave_out_robot(
     state: MapState,
     cloud: jax.Array,
     predicted: jax.Array,
-    prior: tuple[Any, Any],
     robot: tuple[jax.Array, jax.Array],
-    noise: Any,
-    reach_m: jax.Array,
-) -> Registration:
-    """Refines a pose by the returns that are not on the robot."""
+    noise: jax.Array | None,
+) -> jax.Array:
+    """Sets the rows of a cloud that are on the robot to NaN; all rows if the robot is no robot."""
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     placed = rays.place_cloud(state.config, cloud, finite, predicted, noise)
-    others = rays.remove_robot(placed, *robot).in_range
-    cloud = jnp.where(others[:, None], cloud, jnp.nan)
-    return refine_pose(state, cloud, predicted, prior, noise=noise, reach_m=reach_m)
+    others = rays.remove_robot(placed, *robot).in_range & extras_are_valid(robot, noise)
+    return jnp.where(others[:, None], cloud, jnp.nan)
 
 
-_refine_without_robot_jit = jax.jit(_refine_without_robot)
+def _leave_out_robot_on_host(
+    state: MapState,
+    cloud: Any,
+    predicted: Any,
+    robot: tuple[jax.Array, jax.Array],
+    noise: jax.Array | None,
+) -> tuple[np.ndarray, bool]:
+    """Sets the rows of a cloud that are on the robot to NaN, and returns whether all are.
+
+    A cloud of the robot alone is returned as it is: `update` leaves its returns out.
+    """
+    floats, finite = cloud_and_returns(cloud)
+    noise_now = np.asarray(state.config.range_noise if noise is None else noise)
+    centers, radii = (np.asarray(part) for part in robot)
+    on_robot = rays.is_on_robot_on_host(floats, check_pose(predicted), centers, radii, noise_now)
+    if not (finite & ~on_robot).any():
+        return floats, True
+    return np.where(on_robot[:, None], np.float32(np.nan), floats), False
 
 
 @plain

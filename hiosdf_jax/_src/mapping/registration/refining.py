@@ -138,7 +138,7 @@ def refine_pose(
         ...     state = hio.update(state, cloud, found.pose)
     """
     field = as_field(field)
-    prior = checked_prior(prior)
+    prior = _checked_prior(prior)
     _, checked_noise = check_extras(None, noise)
     reach = checked_reach(reach_m)
     check_whole("starts", starts, 1, MOST_STARTS)
@@ -247,7 +247,7 @@ def checked_reach(reach_m: Any) -> Any:
     return jnp.asarray(reach_m, jnp.float32)
 
 
-def checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
+def _checked_prior(prior: Any) -> tuple[jax.Array, jax.Array] | None:
     """Checks a prior, of tracers only the shapes."""
     if prior is None:
         return None
