@@ -196,7 +196,7 @@ def _leave_out_robot(
     robot: tuple[jax.Array, jax.Array],
     noise: jax.Array | None,
 ) -> jax.Array:
-    """Sets the rows of a cloud that are on the robot to NaN; all rows if the robot is no robot."""
+    """Sets the rows of a cloud on the robot to NaN; all rows if the spheres are invalid."""
     finite = jnp.all(jnp.isfinite(cloud), axis=-1)
     placed = rays.place_cloud(state.config, cloud, finite, predicted, noise)
     others = rays.remove_robot(placed, *robot).in_range & extras_are_valid(robot, noise)
