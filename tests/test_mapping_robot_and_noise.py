@@ -9,6 +9,7 @@ from room import CONFIG, arrays_equal, distances, room_cloud
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid import rays
 from hiosdf_jax._src.mapping import pipeline
+from hiosdf_jax._src.numerics import robot_and_noise
 
 CENTERS = np.array([[0.3, 0.05, 0.0], [0.42, 0.05, 0.05]], np.float32)  # m, world
 RADII = np.array([0.06, 0.05], np.float32)
@@ -113,10 +114,15 @@ def test_the_host_finds_the_same_returns_on_the_robot(seed):
     placed = rays.place_cloud(CONFIG, cloud, finite, pose, jnp.asarray(noise))
     left = rays.remove_robot(placed, jnp.asarray(centers), jnp.asarray(radii, jnp.float32))
     expected = np.asarray(placed.in_range & ~left.in_range)
-    found = rays.is_on_robot_on_host(cloud, pose, centers, radii, noise)
     assert 20 < expected.sum() < 360
-    np.testing.assert_array_equal(found[np.asarray(placed.in_range)], expected[placed.in_range])
-    assert not found[:20].any()
+    robot = centers, radii.astype(np.float32)
+    on_host, only_robot = robot_and_noise.leave_out_robot_on_host(cloud, pose, robot, noise)
+    assert not only_robot
+    traced = jax.jit(robot_and_noise.leave_out_robot)(cloud, pose, robot, noise)
+    for left in (on_host, np.asarray(traced)):
+        found = finite & np.isnan(left).any(axis=1)
+        np.testing.assert_array_equal(found[placed.in_range], expected[placed.in_range])
+        np.testing.assert_array_equal(left[~found], cloud[~found])
 
 
 def test_no_spheres_are_no_robot(empty_map):

@@ -6,17 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.numerics.modes import varying_like
+from hiosdf_jax._src.numerics.robot_and_noise import is_on_robot
 from hiosdf_jax._src.numerics.vectors import length, split
-
-# Noise moves returns off the robot. They count as on it up to this distance from its spheres, m, or
-# this multiple of the standard deviation of their range, whichever is larger.
-_ROBOT_MARGIN_M = 0.03
-_ROBOT_MARGIN_SIGMAS = 3.0
 
 HIDDEN_VOXELS = 4
 """A ray changes no voxel farther than this behind its end."""
@@ -100,46 +94,5 @@ def remove_robot(rays: Rays, centers_world: jax.Array, radii: jax.Array) -> Rays
     Returns:
         The rays; those that end on the robot are not in range.
     """
-    margin = jnp.maximum(_ROBOT_MARGIN_M, _ROBOT_MARGIN_SIGMAS * rays.sigma)
-
-    def add(found: jax.Array, sphere: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        center, radius = sphere
-        distance = length(split(rays.points_world - center))
-        return found | (distance <= radius + margin), None
-
-    start = varying_like(jnp.zeros(rays.ends.shape, bool), rays, centers_world, radii)
-    found, _ = jax.lax.scan(add, start, (centers_world, radii))
+    found = is_on_robot(rays.points_world, rays.sigma, centers_world, radii)
     return rays._replace(in_range=rays.in_range & ~found, ends=rays.ends & ~found)
-
-
-def is_on_robot_on_host(
-    cloud: np.ndarray,
-    pose: np.ndarray,
-    centers_world: np.ndarray,
-    radii: np.ndarray,
-    noise: np.ndarray,
-) -> np.ndarray:
-    """Returns which rows `remove_robot` removes, without the device.
-
-    Args:
-        cloud: (N, 3) float32 m, sensor frame.
-        pose: (4, 4) T_world_sensor.
-        centers_world: Centers of the robot's spheres, (K, 3) m.
-        radii: Their radii, (K,) m.
-        noise: (a, b) of the standard deviation a + b r^2 at range r, m and 1/m.
-
-    Returns:
-        (N,) bool; False for rows with a NaN or inf.
-    """
-    centers = (centers_world - pose[:3, 3]) @ pose[:3, :3]
-    squares = np.einsum("ij,ij->i", cloud, cloud)
-    margin = np.maximum(_ROBOT_MARGIN_M, _ROBOT_MARGIN_SIGMAS * (noise[0] + noise[1] * squares))
-    reach = (np.linalg.norm(centers, axis=1) + radii).max()
-    near = np.flatnonzero(squares <= (reach + margin) ** 2)  # most returns are beyond the robot
-    on_robot = np.zeros(len(near), bool)
-    for center, radius in zip(centers, radii, strict=True):
-        offsets = cloud[near] - center
-        on_robot |= np.einsum("ij,ij->i", offsets, offsets) <= (radius + margin[near]) ** 2
-    found = np.zeros(len(cloud), bool)
-    found[near] = on_robot
-    return found

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
-from hiosdf_jax._src.grid import rays
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
 from hiosdf_jax._src.mapping.registration.equations import UNKNOWN_M
@@ -20,15 +19,13 @@ from hiosdf_jax._src.mapping.registration.refining import (
     refine_pose,
 )
 from hiosdf_jax._src.numerics.arrays import on_device
-from hiosdf_jax._src.numerics.intake import (
-    as_array,
-    as_traced,
-    check_pose,
-    cloud_and_returns,
-    is_traced,
-)
+from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import plain
-from hiosdf_jax._src.numerics.robot_and_noise import check_extras, extras_are_valid
+from hiosdf_jax._src.numerics.robot_and_noise import (
+    check_extras,
+    leave_out_robot,
+    leave_out_robot_on_host,
+)
 from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.flags import Flag
 from hiosdf_jax._src.state.pytrees import MapState, Report
@@ -97,16 +94,17 @@ def track(
     traced = is_traced(*jax.tree.leaves((state, prior, checked_robot, checked_noise, reach)))
     traced = traced or is_traced(cloud, predicted_pose)
     only_robot = False
+    noise_now = state.config.range_noise if checked_noise is None else checked_noise
     if traced:
         cloud, pose = as_traced(cloud, predicted_pose)
         fused_cloud, start = cloud, pose
         if checked_robot is not None:
-            cloud = _leave_out_robot(state, cloud, pose, checked_robot, checked_noise)
+            cloud = leave_out_robot(cloud, pose, checked_robot, noise_now)
     else:
         if checked_robot is not None:
             # Before rows are drawn: few of them may be off the robot.
-            cloud, only_robot = _leave_out_robot_on_host(
-                state, cloud, predicted_pose, checked_robot, checked_noise
+            cloud, only_robot = leave_out_robot_on_host(
+                cloud, predicted_pose, checked_robot, noise_now
             )
         padded, pose = check_and_pad(cloud, predicted_pose, state.config.max_points)
         fused_cloud, start = jax.device_put((padded, pose))
@@ -186,41 +184,6 @@ def prior_of_prediction(pose: Any, reach_m: jax.Array | float) -> tuple[Any, Any
 def is_near(predicted: jax.Array, pose: jax.Array, reach_m: jax.Array | float) -> jax.Array:
     """Returns whether `track` takes a pose (4, 4) that far from the predicted one (4, 4), ()."""
     return jnp.maximum(*distance_and_angle(predicted, pose)) <= _MOST_MOVED * reach_m
-
-
-@plain
-def _leave_out_robot(
-    state: MapState,
-    cloud: jax.Array,
-    predicted: jax.Array,
-    robot: tuple[jax.Array, jax.Array],
-    noise: jax.Array | None,
-) -> jax.Array:
-    """Sets the rows of a cloud on the robot to NaN; all rows if the spheres are invalid."""
-    finite = jnp.all(jnp.isfinite(cloud), axis=-1)
-    placed = rays.place_cloud(state.config, cloud, finite, predicted, noise)
-    others = rays.remove_robot(placed, *robot).in_range & extras_are_valid(robot, noise)
-    return jnp.where(others[:, None], cloud, jnp.nan)
-
-
-def _leave_out_robot_on_host(
-    state: MapState,
-    cloud: Any,
-    predicted: Any,
-    robot: tuple[jax.Array, jax.Array],
-    noise: jax.Array | None,
-) -> tuple[np.ndarray, bool]:
-    """Sets the rows of a cloud that are on the robot to NaN, and returns whether all are.
-
-    A cloud of the robot alone is returned as it is: `update` leaves its returns out.
-    """
-    floats, finite = cloud_and_returns(cloud)
-    noise_now = np.asarray(state.config.range_noise if noise is None else noise)
-    centers, radii = (np.asarray(part) for part in robot)
-    on_robot = rays.is_on_robot_on_host(floats, check_pose(predicted), centers, radii, noise_now)
-    if not (finite & ~on_robot).any():
-        return floats, True
-    return np.where(on_robot[:, None], np.float32(np.nan), floats), False
 
 
 @plain
