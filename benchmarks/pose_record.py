@@ -61,7 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def finish(options: argparse.Namespace, part: str, stream: str, rows: Rows) -> int:
-    """Writes rows into a record or compares them with the committed one, as the options say.
+    """Writes rows into a record, and compares them with the committed one, as the options say.
 
     Args:
         options: Those of `add_options`.
@@ -111,15 +111,16 @@ def compare(committed: Rows, rows: Rows) -> tuple[list[str], int]:
     Returns:
         A line for each figure that is worse or no number, and how many figures were compared.
     """
+    limits = _MOST | _LEAST
     worse, compared = [], 0
     for row in rows.keys() & committed.keys():
         old, new = committed[row], rows[row]
         varies = row.split(", seed")[0] in _VARYING
-        for figure in ("fused_wrong",) if varies else (*_MOST, *_LEAST):
+        for figure in ("fused_wrong",) if varies else limits:
             if figure not in old or figure not in new:
                 continue
             compared += 1
-            factor, addend = (_MOST | _LEAST)[figure]
+            factor, addend = limits[figure]
             limit = factor * old[figure] + addend
             holds = new[figure] >= limit if figure in _LEAST else new[figure] <= limit
             if not holds:  # also for NaN

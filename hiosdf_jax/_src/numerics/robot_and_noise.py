@@ -139,11 +139,11 @@ def leave_out_robot_on_host(
         noise: As for `leave_out_robot`.
 
     Returns:
-        The cloud (N, 3) float32, and whether all returns are on the robot. Then they are left in:
-        without a return it would be no cloud.
+        The cloud (N, 3) float32, and whether all returns are on the robot. Then the cloud is
+        returned as it is, since a cloud needs a return.
 
     Raises:
-        ValueError: The cloud or the pose is none.
+        ValueError: The cloud is misshapen or has no return, or the pose is not finite or not rigid.
     """
     floats, finite = cloud_and_returns(cloud)
     matrix = check_pose(pose)
