@@ -2,16 +2,19 @@
 
     python -m benchmarks.registration
     python -m benchmarks.registration --stream ../shared/data/house_depth.npz --tries 10
+    python -m benchmarks.registration --stream ../shared/data/house_depth.npz --all
     python -m benchmarks.registration --between 200 --tries 1
     python -m benchmarks.registration --between 80 --tries 1 --occluded
     python -m benchmarks.registration --stream house_depth.npz --config default --hypotheses 4096
 
-Without `--stream` the frames are those of the demo's camera. `--between` takes this many poses on
-its path instead, almost all between the frames of the map. `--occluded` puts a quarter of the
-returns at 0.55 of their range, as on a person, and the poses 10 cm and 4 degrees off. `--map` takes
-a saved map, made of all frames but the held-out ones, instead of making it. `--bake` refines by a
-baked field. `--hypotheses` times this many poses at once, and one pose inside `jit`. `--output`
-writes a record of the errors, and `--gate` compares them with the committed one.
+Without `--stream` the frames are those of the demo's camera. A tenth of them is held out. `--all`
+makes ten maps, each without another tenth, so that almost every frame is held out once. `--between`
+takes this many poses on the demo's path instead, almost all between the frames of the map.
+`--occluded` puts a quarter of the returns at 0.55 of their range, as on a person, and the poses 10
+cm and 4 degrees off. `--map` takes a saved map, made of all frames but the held-out ones, instead
+of making it. `--bake` refines by a baked field. `--hypotheses` times this many poses at once, and
+one pose inside `jit`. `--output` writes a record of the errors, and `--gate` compares them with the
+committed one.
 """
 
 from __future__ import annotations
@@ -92,11 +95,19 @@ def make_map(stream, held_out, config_name):
     return state
 
 
-def measure_case(field, frames, distance_m, angle_deg, tries):
-    """Refines perturbed poses; returns the figures of their errors, and the median time, ms."""
+def measure_case(parts, distance_m, angle_deg, tries):
+    """Refines perturbed poses; returns the figures of their errors, and the median time, ms.
+
+    Args:
+        parts: Pairs of a map and the frames that it was not given.
+        distance_m: How far the poses are off.
+        angle_deg: The same.
+        tries: Poses per frame.
+    """
     rng = np.random.default_rng(0)
     errors, squares, seconds, converged = [], [], [], []
-    for cloud, pose in frames:
+    held_out = [(field, *frame) for field, frames in parts for frame in frames]
+    for field, cloud, pose in held_out:
         for _ in range(tries if distance_m else 1):
             start = perturb(pose, rng, distance_m, angle_deg)
             begin = time.perf_counter()
@@ -160,6 +171,7 @@ def main():
     parser.add_argument("--map", type=Path, help="a saved map without the held-out frames")
     parser.add_argument("--tries", type=int, default=10, help="perturbations per frame")
     parser.add_argument("--between", type=int, default=0, help="poses between the demo's frames")
+    parser.add_argument("--all", action="store_true", help="hold out almost every frame once")
     parser.add_argument("--occluded", action="store_true", help="see above")
     parser.add_argument("--config", choices=("light", "default"), default="light")
     parser.add_argument("--bake", type=float, metavar="M", help="bake the map at this resolution")
@@ -168,27 +180,38 @@ def main():
     arguments = parser.parse_args()
     if arguments.between and arguments.stream:
         parser.error("--between is for the demo, without --stream")
+    if arguments.all and (arguments.between or arguments.map):
+        parser.error("--all makes its own maps, and takes their frames")
     stream = (
         datasets.open_stream(arguments.stream) if arguments.stream else demo.ApartmentStream(80)
     )
-    held_out = held_out_frames(len(stream))
-    if arguments.map:
-        state = hio.load(arguments.map)
-    else:
-        state = make_map(stream, held_out, arguments.config)
-    field = hio.bake(state, arguments.bake) if arguments.bake else hio.snapshot(state)
-    frames = [stream[i] for i in held_out]
+    parts = []
+    first = held_out_frames(len(stream))
+    for shift in range(first.step if arguments.all else 1):
+        held_out = range(first.start + shift, len(stream), first.step)
+        if arguments.map:
+            state = hio.load(arguments.map)
+        else:
+            state = make_map(stream, held_out, arguments.config)
+        field = hio.bake(state, arguments.bake) if arguments.bake else hio.snapshot(state)
+        parts.append((field, [stream[i] for i in held_out]))
+    field, frames = parts[0]
     if arguments.between:
         dense = demo.ApartmentStream(arguments.between)
         frames = [dense[i] for i in range(len(dense))]
+        parts = [(field, frames)]
     if arguments.occluded:
         rng = np.random.default_rng(2)
-        frames = [(occlude(cloud, rng), pose) for cloud, pose in frames]
+        parts = [
+            (field, [(occlude(cloud, rng), pose) for cloud, pose in frames])
+            for field, frames in parts
+        ]
+        frames = parts[0][1]
     rows = {}
     print("| off by | " + " | ".join(DECIMALS) + " | ms |\n" + "| --- " * (len(DECIMALS) + 2) + "|")
     for distance_m, angle_deg in (OCCLUDED_CASE,) if arguments.occluded else CASES:
         name = f"{100 * distance_m:g} cm, {angle_deg:g} degrees"
-        rows[name], ms = measure_case(field, frames, distance_m, angle_deg, arguments.tries)
+        rows[name], ms = measure_case(parts, distance_m, angle_deg, arguments.tries)
         cells = [f"{rows[name][figure]:.{digits}f}" for figure, digits in DECIMALS.items()]
         print(f"| {name} | " + " | ".join(cells) + f" | {ms:.1f} |", flush=True)
     rng = np.random.default_rng(1)
@@ -200,6 +223,7 @@ def main():
         print_hypotheses(field, frames, arguments.hypotheses)
     name = arguments.stream.stem if arguments.stream else "demo"
     name += ", occluded" * arguments.occluded + f", {arguments.config}"
+    name += ", all frames" * arguments.all
     name += f", {arguments.between} poses" * bool(arguments.between)
     name += f", {arguments.tries} tries" * (arguments.tries != (1 if arguments.between else 10))
     name += f", baked at {arguments.bake} m" if arguments.bake else ""

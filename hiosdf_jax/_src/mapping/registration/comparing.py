@@ -230,7 +230,7 @@ def _residuals_at(
     transform, (scale_m, share, growing, length) = numbers[:12], numbers[12:]
     offset = each(lambda row: dot(transform[row : row + 3], point), (0, 4, 8))
     point_world = each(jnp.add, offset, transform[3::4])
-    found = match(point_world, offset, growing, share)
+    found = match(point_world, offset, growing, share, sigma[0])
     # Only the part of the error along the normal counts.
     square = jnp.maximum(dot(offset, offset), 1e-6)
     along = jnp.minimum(dot(found.normal, offset) ** 2 / square, 1)

@@ -34,6 +34,17 @@ _LEAST_WIDTH_VOXELS = 0.1, 0.2
 _NARROW_VOXELS = 0.20
 _WIDE_VOXELS = 0.22
 
+# Far returns are so noisy that many come to lie nearer to the back of a thing than to its front,
+# where the map's distance leads the wrong way. The height above the mean plane is linear in the
+# noise, which then averages out. So in a complete map returns with a standard deviation above the
+# first value, m, begin to take planes, and above the second one take nothing else. Of 315 poses of
+# 105 held-out frames in a house, 95 % are then off by at most 0.88 instead of 1.55 cm, and the mean
+# normalized square is 9.5 instead of 42. If all but the nearest returns take planes (0.5 to 1.5 cm)
+# the median rises from 0.27 to 0.37 cm. In a map that grows the planes made tracking worse: without
+# odometry, the error of an apartment's map rose from 1.0 to 1.2 cm.
+_EXACT_M = 0.01
+_NOISY_M = 0.04
+
 # A return contradicts the map if it is this far inside observed space, and this far from patches.
 _FREE_VOXELS = 0.5
 _EMPTY_VOXELS = 1.5
@@ -92,6 +103,7 @@ def match_at(
     offset: Vector,
     growing: jax.Array,
     share: jax.Array,
+    sigma: jax.Array,
 ) -> Match:
     """Compares points with a map by its grid alone: the network changes no surface and costs more.
 
@@ -102,6 +114,7 @@ def match_at(
         offset: The same relative to the sensor, (...) m each.
         growing: How incomplete the map is, from 0 to 1.
         share: How far distances are the map's own; see `share_of_map`.
+        sigma: Standard deviation of the range, (...) m.
 
     Returns:
         The comparison. Differentiable by the points.
@@ -130,10 +143,12 @@ def match_at(
     usable &= width > between(_LEAST_WIDTH_VOXELS, strict)
 
     # A sheet's distance grows on both sides, the height above its plane on one.
+    noisy = jnp.clip((sigma - _EXACT_M) / (_NOISY_M - _EXACT_M), 0, 1) * (1 - growing)
     side = jnp.where(dot(own_normal, plane.normal) < 0, -1, 1)
-    distance = share * nearest.sdf + (1 - share) * side * plane.height
-    normal = each(lambda n, p: share * n + (1 - share) * side * p, own_normal, plane.normal)
-    spread = share * nearest.spread + (1 - share) * plane.spread
+    own = share * (1 - noisy)
+    distance = own * nearest.sdf + (1 - own) * side * plane.height
+    normal = each(lambda n, p: own * n + (1 - own) * side * p, own_normal, plane.normal)
+    spread = own * nearest.spread + (1 - own) * plane.spread
     other_side = dot(plane.normal, offset) > 0
     spread = jnp.where(other_side, jnp.sqrt(spread**2 + (_THICKNESS_VOXELS * size) ** 2), spread)
     usable &= ~(other_side & (growing > _GROWS))
