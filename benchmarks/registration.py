@@ -95,6 +95,31 @@ def make_map(stream, held_out, config_name):
     return state
 
 
+def make_parts(stream, options):
+    """Returns pairs of a map and the frames to find in it, as the options say."""
+    parts = []
+    first = held_out_frames(len(stream))
+    for shift in range(first.step if options.all else 1):
+        held_out = range(first.start + shift, len(stream), first.step)
+        if options.map:
+            state = hio.load(options.map)
+        else:
+            state = make_map(stream, held_out, options.config)
+        field = hio.bake(state, options.bake) if options.bake else hio.snapshot(state)
+        frames = [stream[i] for i in held_out]
+        if options.between:
+            dense = demo.ApartmentStream(options.between)
+            frames = [dense[i] for i in range(len(dense))]
+        parts.append((field, frames))
+    if options.occluded:
+        rng = np.random.default_rng(2)
+        parts = [
+            (field, [(occlude(cloud, rng), pose) for cloud, pose in frames])
+            for field, frames in parts
+        ]
+    return parts
+
+
 def measure_case(parts, distance_m, angle_deg, tries):
     """Refines perturbed poses; returns the figures of their errors, and the median time, ms.
 
@@ -185,28 +210,8 @@ def main():
     stream = (
         datasets.open_stream(arguments.stream) if arguments.stream else demo.ApartmentStream(80)
     )
-    parts = []
-    first = held_out_frames(len(stream))
-    for shift in range(first.step if arguments.all else 1):
-        held_out = range(first.start + shift, len(stream), first.step)
-        if arguments.map:
-            state = hio.load(arguments.map)
-        else:
-            state = make_map(stream, held_out, arguments.config)
-        field = hio.bake(state, arguments.bake) if arguments.bake else hio.snapshot(state)
-        parts.append((field, [stream[i] for i in held_out]))
+    parts = make_parts(stream, arguments)
     field, frames = parts[0]
-    if arguments.between:
-        dense = demo.ApartmentStream(arguments.between)
-        frames = [dense[i] for i in range(len(dense))]
-        parts = [(field, frames)]
-    if arguments.occluded:
-        rng = np.random.default_rng(2)
-        parts = [
-            (field, [(occlude(cloud, rng), pose) for cloud, pose in frames])
-            for field, frames in parts
-        ]
-        frames = parts[0][1]
     rows = {}
     print("| off by | " + " | ".join(DECIMALS) + " | ms |\n" + "| --- " * (len(DECIMALS) + 2) + "|")
     for distance_m, angle_deg in (OCCLUDED_CASE,) if arguments.occluded else CASES:

@@ -162,7 +162,7 @@ def _rows(part: str, stream: str) -> dict[str, dict[str, Any]]:
 
 
 def _count(row: dict[str, Any], key: str) -> str:
-    return f"{row[key]:.0f}"
+    return f"{row[key]:,.0f}"
 
 
 def _cm(value: float) -> str:

@@ -142,8 +142,8 @@ def match_at(
     usable &= beside < between(_MOST_BESIDE_VOXELS, strict)
     usable &= width > between(_LEAST_WIDTH_VOXELS, strict)
 
-    # A sheet's distance grows on both sides, the height above its plane on one.
     noisy = jnp.clip((sigma - _EXACT_M) / (_NOISY_M - _EXACT_M), 0, 1) * (1 - growing)
+    # A sheet's distance grows on both sides, the height above its plane on one.
     side = jnp.where(dot(own_normal, plane.normal) < 0, -1, 1)
     own = share * (1 - noisy)
     distance = own * nearest.sdf + (1 - own) * side * plane.height
