@@ -29,6 +29,9 @@ LARGER_BOUNDS = ((-2.05, -1.0, -1.5), (1.2, 3.0, 0.8))
 # Not on faces of voxels, where rounding decides which voxel a return falls in.
 HALF = np.array([0.97, 0.78, 0.56])
 
+# A box before the end of the room, |y| and |z| < BOX_HALF. From the origin it hides a seventh.
+BOX_FRONT_X, BOX_HALF = 0.4, 0.42
+
 
 def room_cloud(seed, count=250, yaw=0.0, position=(0.0, 0.0, 0.0)):
     """Exact returns of a sensor inside the box |x, y, z| < HALF."""
@@ -43,6 +46,15 @@ def room_cloud(seed, count=250, yaw=0.0, position=(0.0, 0.0, 0.0)):
     reach = (HALF * np.sign(world_rays) - position) / world_rays
     cloud = rays * reach.min(axis=1, keepdims=True)
     return cloud.astype(np.float32), pose
+
+
+def cloud_with_box(seed, count):
+    """Exact returns of a sensor in the middle, where the box stands in the room."""
+    cloud, pose = room_cloud(seed, count)
+    share = BOX_FRONT_X / np.where(cloud[:, 0] > BOX_FRONT_X, cloud[:, 0], np.inf)
+    at_front = np.abs(cloud[:, 1:] * share[:, None]) < BOX_HALF
+    share = np.where(at_front.all(axis=1) & (share > 0), share, 1)
+    return (cloud * share[:, None]).astype(np.float32), pose
 
 
 def stream(frames=4, count=250):

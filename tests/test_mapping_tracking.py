@@ -4,7 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import CONFIG, HALF, arrays_equal, map_of_room, room_cloud
+from room import (
+    BOX_FRONT_X,
+    CONFIG,
+    HALF,
+    arrays_equal,
+    cloud_with_box,
+    distances,
+    map_of_room,
+    room_cloud,
+)
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
@@ -79,6 +88,20 @@ def test_few_returns_correct_a_prediction_that_is_three_deviations_off(sharp_map
     _, found = hio.track(sharp_map, cloud[np.array(rows)], moved(pose, [0.14, 0, 0], np.zeros(3)))
     assert bool(found.converged)
     assert np.linalg.norm(np.asarray(found.pose)[:3, 3] - pose[:3, 3]) < 0.01
+
+
+def test_something_that_leaves_is_seen_gone(empty_map):
+    """At first a seventh of the rays goes through what the map takes for solid."""
+    place = np.array([[BOX_FRONT_X + 0.15, 0.05 * k, 0.0] for k in range(-3, 4)])
+    state = empty_map
+    for seed in range(20):
+        state, _ = hio.track(state, *cloud_with_box(seed, COUNT))
+    assert distances(hio.snapshot(state), place).max() < 0
+    for seed in range(20, 26):
+        cloud, pose = room_cloud(seed, COUNT)
+        state, found = hio.track(state, cloud, moved(pose, [0.02, -0.01, 0], [0, 0, 0.01]))
+        assert bool(found.converged)
+    assert distances(hio.snapshot(state), place).min() > 0.1
 
 
 def test_the_first_frame_is_fused_as_predicted(empty_map):

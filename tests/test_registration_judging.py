@@ -4,8 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from room import HALF, room_cloud
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from room import HALF, cloud_with_box, room_cloud
+from scipy.spatial.transform import Rotation
 
+import hiosdf_jax as hio
 from hiosdf_jax._src.mapping.registration.comparing import make_rows
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
@@ -134,3 +138,95 @@ def test_a_wall_blocks_no_ray_that_comes_from_behind(field):
         behind = np.array([HALF[0] + 2.0, 0, 0], np.float32)
         to_back = ends + np.array([way, 0, 0], np.float32) - behind
         assert not blocked_rays(field, shifted(pose, behind), to_back, True).any()
+
+
+DOOR_X, DOOR_HALF = 0.25, 0.35
+
+
+def voxel_centers(config):
+    """(X, Y, Z, 3) m."""
+    index = np.stack(np.meshgrid(*map(np.arange, config.grid_shape), indexing="ij"), axis=-1)
+    return (index + config.corner_index + 0.5) * config.voxel_size
+
+
+def with_sdf(field, sdf):
+    derived = field.surface.derived.replace(sdf=np.asarray(sdf, np.float16))
+    return field.replace(surface=field.surface.replace(derived=derived))
+
+
+def with_door(field):
+    """A wall at x = DOOR_X, seen from one side: behind it all is guessed solid beside the door."""
+    x, y, _ = np.moveaxis(voxel_centers(field.config), -1, 0)
+    to_jamb = np.hypot(DOOR_X - x, DOOR_HALF - np.abs(y))
+    beside = np.abs(y) > DOOR_HALF
+    return with_sdf(field, np.where(beside, DOOR_X - x, to_jamb))
+
+
+def test_a_ray_through_a_door_is_not_blocked_by_the_solid_beside_it(field):
+    field, origin = with_door(field), np.array([-0.8, 0, 0.05])
+    pose = shifted(np.eye(4, dtype=np.float32), origin)
+
+    def rays_through(low, high, times):
+        """Rays through the plane of the wall at some |y|, that many times as long."""
+        y = np.linspace(low, high, 10)
+        ends = np.stack([np.full(20, DOOR_X), [*y, *-y], np.zeros(20)], axis=1)
+        return (times * (ends - origin)).astype(np.float32)
+
+    every = np.ones(20, bool)
+    through_door = rays_through(0.2, 0.25, 1.65)
+    assert np.all(np.abs(through_door[:, 1]) > DOOR_HALF - 0.05)
+    assert not blocked_rays(field, pose, through_door, every).any()
+    assert blocked_rays(field, pose, rays_through(0.47, 0.65, 1.4), every).all()
+
+
+def blocked_slowly(config, sdf, pose, point):
+    """The same of one ray, point by point, and whether rounding could decide it."""
+    offset = pose[:3, :3] @ point
+    distance, size = np.linalg.norm(offset), config.voxel_size
+    reach = max(distance - 1.5 * size, 0)
+    inside, before, close = False, None, False
+    for k in range(32):
+        place = (pose[:3, 3] + offset / distance * reach * (k + 0.5) / 32) / size
+        index = np.floor(place).astype(int) - config.corner_index
+        close |= bool(np.min(np.abs(place - np.round(place))) < 1e-4)
+        known = np.all((index >= 0) & (index < config.grid_shape))
+        now = float(sdf[tuple(index)]) if known else np.inf
+        if now > 0:
+            inside = True
+        elif before is None or before - now > reach / 32 + size:
+            inside = False
+        if inside and now < -size:
+            return True, close
+        before = now
+    return False, close
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1))
+def test_blocked_rays_are_those_of_a_walk_along_each_ray(field, seed):
+    rng = np.random.default_rng(seed)
+    centers = voxel_centers(field.config)
+
+    def plane():
+        normal = rng.normal(size=3)
+        return centers @ (normal / np.linalg.norm(normal)) + rng.uniform(-0.3, 0.8)
+
+    sdf = np.where(plane() > 0, plane(), plane()).astype(np.float16)
+    pose = shifted(np.eye(4, dtype=np.float32), rng.uniform(-0.7, 0.7, 3))
+    pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    cloud = (rng.normal(size=(200, 3)) * 0.8).astype(np.float32)
+    found = blocked_rays(with_sdf(field, sdf), pose, cloud, np.ones(200, bool))
+    walked = [blocked_slowly(field.config, sdf, pose.astype(float), point) for point in cloud]
+    expected, close = np.transpose(walked)
+    np.testing.assert_array_equal(found[~close], expected[~close])
+
+
+def test_something_that_is_gone_leaves_a_right_pose_right(empty_map):
+    """It hid a seventh of the view. A map that refused the pose would never see it gone."""
+    state = empty_map
+    for seed in range(30):
+        state = hio.update(state, *cloud_with_box(seed, 300))
+    cloud, pose = room_cloud(6, COUNT)
+    blocked = blocked_rays(field_of(state), pose, cloud[:200], np.ones(200, bool))
+    assert blocked.mean() > 0.12
+    assert bool(verdict(field_of(state), cloud, pose).fits)

@@ -62,12 +62,12 @@ _THICKNESS_VOXELS = 12**-0.5
 _GROWS = 0.5
 
 # This many points of each ray are looked up. The last one is the first distance before the return.
-# A point is in a solid if it is the second distance behind a surface. One voxel nearer to the
-# sensor the signed distance is larger, by less than the third, unless the ray comes from behind.
+# A point is in a solid if it is the second distance behind a surface. The ray must have entered
+# there: between two points the signed distance falls by their spacing, and at most the third more.
 _RAY_POINTS = 32
 _BEFORE_VOXELS = 1.5
 _SOLID_VOXELS = 1.0
-_FRONT_VOXELS = 2.0
+_JUMP_VOXELS = 1.0
 
 # The error of trilinear interpolation near surfaces, as a share of the samples' spacing.
 _BAKED_SPREAD = 0.05
@@ -209,14 +209,16 @@ def find_blocked(
     reach = jnp.maximum(1 - _BEFORE_VOXELS * voxel_size / distance, 0)
     share = (jnp.arange(_RAY_POINTS, dtype=jnp.float32) + 0.5) / _RAY_POINTS * reach[:, None]
     points_world = pose[:3, 3] + offset[:, None] * share[..., None]
-    before = points_world - voxel_size * (offset / distance[:, None])[:, None]
-    here, there = (
-        _voxel_sdf(field.config, field.surface, split(points)) for points in (points_world, before)
-    )
-    # The ray must come from the front. Behind walls that were seen from one side, solids are a
-    # guess, and a sensor in the next room sees the wall from there.
-    enters = (there > here) & (there < here + _FRONT_VOXELS * voxel_size)
-    solid = enters & (here < -_SOLID_VOXELS * voxel_size)
+    sdf = _voxel_sdf(field.config, field.surface, split(points_world))
+    most_fall = (distance * reach / _RAY_POINTS + _JUMP_VOXELS * voxel_size)[:, None]
+    jumps = jnp.pad(sdf[:, :-1] - sdf[:, 1:] > most_fall, ((0, 0), (1, 0)))
+    # Behind a wall that was seen from one side, the solid is a guess. A ray through a door or from
+    # the next room gets into it beside the wall, where the signed distance jumps. The last event,
+    # even for a jump and odd for a point in front of a surface, says how the ray got to a point.
+    number = 2 * jnp.arange(_RAY_POINTS)
+    event = jnp.where(sdf > 0, number + 1, jnp.where(jumps, number, 0))
+    entered = jax.lax.cummax(event, axis=1) % 2 == 1
+    solid = entered & (sdf < -_SOLID_VOXELS * voxel_size)
     return some & jnp.any(solid, axis=-1)
 
 
