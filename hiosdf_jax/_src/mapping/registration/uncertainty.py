@@ -28,11 +28,11 @@ _SPREAD_CELL_M = 0.5
 
 # Size of the cells that are left out in turn: a share of the typical range, and its limits, m.
 # Errors of a map reach about this far. For 200 poses in the simulated apartment the mean normalized
-# square is 6.4, and 6 is right. With earlier code it was 6.2; with 3,072 returns 5.5, with cells of
-# 0.5 m 7.1, and with cells of 1.2 m 5.4. Cells are spread to this many sums, or fewer if the rows
-# are few. Those that share one are left out at once.
-_LEFT_OUT_SHARE = 0.4
-_LEFT_OUT_M = (0.2, 1.0)
+# square is 5.6, and for 126 in a house 7.9; 6 is right. With cells of at most 1 m, 0.4 of the
+# range, it is 5.0 and 8.7, and with 0.27 of the range 5.8 and 8.8. Cells are spread to this many
+# sums, or fewer if the rows are few. Those that share one are left out at once.
+_LEFT_OUT_SHARE = 1 / 3
+_LEFT_OUT_M = (0.2, 1.5)
 _LEFT_OUT_SUMS = 1024
 _LEAST_SUMS = 512
 _LEAST_LEFT = 1e-3  # share of a direction's information that always stays
