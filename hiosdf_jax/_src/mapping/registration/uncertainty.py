@@ -28,7 +28,7 @@ _SPREAD_CELL_M = 0.5
 
 # Size of the cells that are left out in turn: a share of the typical range, and its limits, m.
 # Errors of a map reach about this far. For 200 poses in the simulated apartment the mean normalized
-# square is 5.6, and for 126 in a house 7.9; 6 is right. With cells of at most 1 m, 0.4 of the
+# square is 5.6, and for 99 in a house 7.9; 6 is right. With cells of at most 1 m, 0.4 of the
 # range, it is 5.0 and 8.7, and with 0.27 of the range 5.8 and 8.8. Cells are spread to this many
 # sums, or fewer if the rows are few. Those that share one are left out at once.
 _LEFT_OUT_SHARE = 1 / 3
