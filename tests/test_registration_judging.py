@@ -91,6 +91,17 @@ def test_rays_through_a_wall_count_where_nothing_else_contradicts(field):
     assert not bool(wrong.fits)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.18])
+@pytest.mark.parametrize("way", [0.3, 0.4, 0.5])
+def test_rays_through_the_end_of_a_tube_refuse_a_pose(field, share, way):
+    """Nothing but the end holds the pose along the tube, and it would lie in unseen space."""
+    sides, pose = returns_of([1, 2], round((1 - share) * COUNT))
+    ends, _ = returns_of([0], COUNT)
+    cloud = np.concatenate([sides, ends[ends[:, 0] > 0][: round(share * COUNT)]])
+    assert bool(verdict(field, cloud, pose).fits)
+    assert not bool(verdict(field, cloud, shifted(pose, [way, 0, 0])).fits)
+
+
 def test_a_view_of_a_floor_alone_fits_in_spite_of_outliers(field):
     flat, pose = returns_of([2], COUNT)
     flat[:30] *= 0.5
@@ -180,20 +191,20 @@ def test_a_ray_through_a_door_is_not_blocked_by_the_solid_beside_it(field):
 
 
 def blocked_slowly(config, sdf, pose, point):
-    """The same of one ray, point by point, and whether rounding could decide it."""
+    """Walks along a ray: whether it is blocked, and whether rounding could decide that."""
     offset = pose[:3, :3] @ point
     distance, size = np.linalg.norm(offset), config.voxel_size
     reach = max(distance - 1.5 * size, 0)
     inside, before, close = False, None, False
-    for k in range(32):
-        place = (pose[:3, 3] + offset / distance * reach * (k + 0.5) / 32) / size
+    for k in range(64):
+        place = (pose[:3, 3] + offset / distance * reach * (k + 0.5) / 64) / size
         index = np.floor(place).astype(int) - config.corner_index
         close |= bool(np.min(np.abs(place - np.round(place))) < 1e-4)
         known = np.all((index >= 0) & (index < config.grid_shape))
         now = float(sdf[tuple(index)]) if known else np.inf
         if now > 0:
             inside = True
-        elif before is None or before - now > reach / 32 + size:
+        elif before is None or before - now > reach / 64 + 2**0.5 * size:
             inside = False
         if inside and now < -size:
             return True, close
@@ -221,7 +232,7 @@ def test_blocked_rays_are_those_of_a_walk_along_each_ray(field, seed):
     np.testing.assert_array_equal(found[~close], expected[~close])
 
 
-def test_something_that_is_gone_leaves_a_right_pose_right(empty_map):
+def test_something_that_is_gone_refuses_no_right_pose(empty_map):
     """It hid a seventh of the view. A map that refused the pose would never see it gone."""
     state = empty_map
     for seed in range(30):

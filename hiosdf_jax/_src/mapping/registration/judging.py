@@ -2,7 +2,7 @@
 
 Floors and ceilings fit at many poses, and most returns of a wrong pose may lie in space that the
 map has not seen. So returns that fit count by how much their normals differ, and rays that would
-have entered known solids count against a pose.
+have entered known solids count against a pose, most where no return holds it along them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from hiosdf_jax._src.mapping.registration.comparing import (
     take_evenly,
 )
 from hiosdf_jax._src.mapping.registration.equations import LEAST_COMPARABLE
-from hiosdf_jax._src.mapping.registration.matching import find_blocked
+from hiosdf_jax._src.mapping.registration.matching import between, find_blocked
+from hiosdf_jax._src.mapping.registration.motion import offsets_from
+from hiosdf_jax._src.numerics.small_matrices import solve_positive
 from hiosdf_jax._src.state.pytrees import Baked, Field
 
 LEAST_INLIERS = 0.7
@@ -31,13 +33,18 @@ LEAST_INLIERS = 0.7
 _LEAST_SHARE = 0.4
 _ALLOWANCE = 0.02
 
-# Returns in free space alone may be of something new. Rays through solids alone may show that
-# something is gone: a map that refuses these poses never sees it gone. Both together are rarely
-# right, so their geometric mean counts most. With these weights 71 of 276 poses that are half a
-# meter off pass in three recordings, and where a quarter of the view is gone, 9 of 114 right poses
-# of the house are refused. With weights of 1 and 2 it is 83, and 40. If each ray above 8 % counted
-# as 13 returns, it would be 139, and all.
-_GONE_WEIGHT = 0.5
+# Rays through known solids: either something is gone, or the pose is too far along the rays. How
+# well the returns that fit hold the pose along a ray is 1 / d^T N^-1 d, where N is the mean outer
+# product of their normals: 1 if all normals are along the ray, and a third if they point
+# everywhere. Along a tube it is 0, or 0.03 by chance. A blocked ray counts as the first weight at
+# 0, and as the second one from _HELD on. A map that refuses a right pose never sees that something
+# is gone.
+_GONE_WEIGHTS = 10.0, 0.5
+_HELD = 0.1
+_LEAST_HELD = 1e-3
+
+# A right pose rarely has both blocked rays and returns that do not fit, so the geometric mean of
+# the two counts most. One ray may be both: through a solid, and to a return in free space.
 _BOTH_WEIGHT = 3.0
 
 _RAYS = 256
@@ -82,10 +89,15 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
     variety = 1 - jnp.linalg.norm(second) / jnp.maximum(jnp.trace(second), 1e-9)
     rays = take_evenly(rows, _RAYS)
     blocked = find_blocked(field, pose, rays.points, rays.some)
-    blocked_share = jnp.sum(blocked) / jnp.maximum(jnp.sum(rays.some), 1)
+    directions = offsets_from(pose, rays.points)
+    directions /= jnp.maximum(jnp.linalg.norm(directions, axis=-1, keepdims=True), 1e-6)
+    mean = second / jnp.maximum(jnp.trace(second), 1e-9) + _LEAST_HELD * jnp.eye(3)
+    held = 1 / jnp.sum(directions * solve_positive(mean, directions), axis=-1)
+    weight = between(_GONE_WEIGHTS, jnp.minimum(held / _HELD, 1))
+    per_ray = total / jnp.maximum(jnp.sum(rays.some), 1)
+    gone = per_ray * jnp.sum(blocked)
     new = jnp.sum(judged & ~on_surface).astype(jnp.float32)
-    gone = blocked_share * total
-    contrary = new + _GONE_WEIGHT * gone + _BOTH_WEIGHT * jnp.sqrt(new * gone)
+    contrary = new + per_ray * jnp.sum(weight * blocked) + _BOTH_WEIGHT * jnp.sqrt(new * gone)
     supporting = variety * inliers + _ALLOWANCE * total
 
     share = inliers.astype(jnp.float32) / jnp.maximum(jnp.sum(judged), 1).astype(jnp.float32)
