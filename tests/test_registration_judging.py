@@ -224,7 +224,7 @@ def test_blocked_rays_are_those_of_a_walk_along_each_ray(field, seed):
 
     sdf = np.where(plane() > 0, plane(), plane()).astype(np.float16)
     pose = shifted(np.eye(4, dtype=np.float32), rng.uniform(-0.7, 0.7, 3))
-    pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    pose[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     cloud = (rng.normal(size=(200, 3)) * 0.8).astype(np.float32)
     found = blocked_rays(with_sdf(field, sdf), pose, cloud, np.ones(200, bool))
     walked = [blocked_slowly(field.config, sdf, pose.astype(float), point) for point in cloud]
