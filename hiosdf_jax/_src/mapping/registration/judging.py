@@ -40,7 +40,7 @@ _ALLOWANCE = 0.02
 # 0, and as the second one from _HELD on. A map that refuses a right pose never sees that something
 # is gone.
 _GONE_WEIGHTS = 10.0, 0.5
-_HELD = 0.1
+_HELD = 0.05
 _LEAST_HELD = 1e-3
 
 # A right pose rarely has both blocked rays and returns that do not fit, so the geometric mean of
