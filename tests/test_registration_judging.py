@@ -10,6 +10,7 @@ from room import HALF, cloud_with_box, room_cloud
 from scipy.spatial.transform import Rotation
 
 import hiosdf_jax as hio
+from hiosdf_jax._src.grid.geometry import voxel_center
 from hiosdf_jax._src.mapping.registration.comparing import make_rows
 from hiosdf_jax._src.mapping.registration.judging import judge
 from hiosdf_jax._src.mapping.registration.matching import find_blocked
@@ -156,8 +157,8 @@ DOOR_X, DOOR_HALF = 0.25, 0.35
 
 def voxel_centers(config):
     """(X, Y, Z, 3) m."""
-    index = np.stack(np.meshgrid(*map(np.arange, config.grid_shape), indexing="ij"), axis=-1)
-    return (index + config.corner_index + 0.5) * config.voxel_size
+    index = np.moveaxis(np.indices(config.grid_shape), 0, -1)
+    return np.asarray(voxel_center(config, jnp.asarray(index)))
 
 
 def with_sdf(field, sdf):

@@ -22,6 +22,7 @@ from hiosdf_jax._src.mapping.registration.equations import LEAST_COMPARABLE
 from hiosdf_jax._src.mapping.registration.matching import between, find_blocked
 from hiosdf_jax._src.mapping.registration.motion import offsets_from
 from hiosdf_jax._src.numerics.small_matrices import solve_positive
+from hiosdf_jax._src.numerics.vectors import join, split, unit
 from hiosdf_jax._src.state.pytrees import Baked, Field
 
 LEAST_INLIERS = 0.7
@@ -86,14 +87,11 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
 
     normals = jnp.where(on_surface[:, None], seen.jacobian[:, :3], 0)
     second = jnp.matmul(normals.T, normals, precision="highest")
-    variety = 1 - jnp.linalg.norm(second) / jnp.maximum(jnp.trace(second), 1e-9)
+    trace = jnp.maximum(jnp.trace(second), 1e-9)
+    variety = 1 - jnp.linalg.norm(second) / trace
     rays = take_evenly(rows, _RAYS)
     blocked = find_blocked(field, pose, rays.points, rays.some)
-    directions = offsets_from(pose, rays.points)
-    directions /= jnp.maximum(jnp.linalg.norm(directions, axis=-1, keepdims=True), 1e-6)
-    mean = second / jnp.maximum(jnp.trace(second), 1e-9) + _LEAST_HELD * jnp.eye(3)
-    held = 1 / jnp.sum(directions * solve_positive(mean, directions), axis=-1)
-    weight = between(_GONE_WEIGHTS, jnp.minimum(held / _HELD, 1))
+    weight = _weigh_blocked(second / trace, offsets_from(pose, rays.points))
     per_ray = total / jnp.maximum(jnp.sum(rays.some), 1)
     gone = per_ray * jnp.sum(blocked)
     new = jnp.sum(judged & ~on_surface).astype(jnp.float32)
@@ -105,3 +103,19 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
     fits &= share >= LEAST_INLIERS
     fits &= supporting >= _LEAST_SHARE * (supporting + contrary)
     return Verdict(jnp.sqrt(square), share, fits)
+
+
+def _weigh_blocked(mean_product: jax.Array, offset: jax.Array) -> jax.Array:
+    """Returns how much a blocked ray counts: more where the returns that fit do not hold the pose.
+
+    Args:
+        mean_product: Mean outer product of the normals of those returns, (3, 3).
+        offset: From the sensor to the end of each ray, (N, 3) m, along the axes of the world.
+
+    Returns:
+        (N,).
+    """
+    direction = join(unit(split(offset)))
+    product = mean_product + _LEAST_HELD * jnp.eye(3)
+    held = 1 / jnp.sum(direction * solve_positive(product, direction), axis=-1)
+    return between(_GONE_WEIGHTS, jnp.minimum(held / _HELD, 1))
