@@ -118,4 +118,4 @@ def _weigh_blocked(mean_product: jax.Array, offset: jax.Array) -> jax.Array:
     direction = join(unit(split(offset)))
     product = mean_product + _LEAST_HELD * jnp.eye(3)
     held = 1 / jnp.sum(direction * solve_positive(product, direction), axis=-1)
-    return between(_GONE_WEIGHTS, jnp.minimum(held / _HELD, 1))
+    return jnp.asarray(between(_GONE_WEIGHTS, jnp.minimum(held / _HELD, 1)))
