@@ -6,6 +6,7 @@
     python -m benchmarks.tracking --stream ../shared/data/house_depth.npz --relocalize 100
     python -m benchmarks.tracking --stream house_depth.npz --relocalize 30 --mapped 60
     python -m benchmarks.tracking --stream ../shared/data/hall_lidar.npz --wrong-poses
+    python -m benchmarks.tracking --stream house_depth.npz --foreign kitchen_depth.npz
 
 `--poses` says what is done to the stream's poses before they are refined:
 
@@ -24,6 +25,8 @@ some of them are at places that the map does not know. `--map` takes a saved map
 another place. It counts right places, wrong ones that have converged, and how many are `sure`.
 
 `--wrong-poses` refines each third frame from poses that are 0.5 and 1 m off, in the map before it.
+`--foreign` tracks the frames of another recording in the map of the whole stream, each at a random
+pose of the stream. Given the stream itself, the pose is at least 1 m from the frame's own.
 
 `--stream demo` is the apartment; 240 frames are 10 Hz at 1 m/s. `--kiss-icp` measures the odometry
 of KISS-ICP on the same clouds beside; it needs `pip install kiss-icp`. `--output` writes a record
@@ -78,6 +81,8 @@ SHIFTS_M = {
     1.0: ((0.6, 0.8, 0), (-0.6, -0.8, 0), (0.8, -0.6, 0), (-0.8, 0.6, 0)),
     0.5: ((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)),
 }
+
+FOREIGN_FROM_M = 1.0
 
 # A frame counts as found within this, m and degrees.
 FOUND = 0.05, 1.0
@@ -230,6 +235,18 @@ def _refine_from(state, cloud, start):
     return found, bool(is_near(start, found.pose, GROWING_REACH_M))
 
 
+def measure_foreign(frames, config, others):
+    """Counts frames of another place that `track` takes, in the map of a whole stream."""
+    state, _, _ = map_stream(frames, config, "exact")
+    rng, row = np.random.default_rng(0), {"tried": 0, "taken": 0}
+    for cloud, pose in tqdm(others, "tracking", leave=False):
+        wrong = [at for _, at in frames if np.linalg.norm((at - pose)[:3, 3]) >= FOREIGN_FROM_M]
+        _, found = hio.track(state, cloud, wrong[rng.integers(len(wrong))])
+        row["tried"] += 1
+        row["taken"] += bool(found.converged)
+    return row
+
+
 def measure_relocalization(frames, numbers, field, up_world):
     """Finds frames in a map; counts right, wrong and sure places; also the median time, s."""
     rng, seconds, places = np.random.default_rng(0), [], []
@@ -279,6 +296,7 @@ def main():
     parser.add_argument("--mapped", type=int, help="map this many frames and find others")
     parser.add_argument("--map", type=Path, help="the map to find them in; made by default")
     parser.add_argument("--wrong-poses", action="store_true", help="see above")
+    parser.add_argument("--foreign", type=Path, help="a recording, of another place")
     parser.add_argument(
         "--frames", type=int, help="use only the first ones; the demo has this many"
     )
@@ -317,6 +335,11 @@ def main():
         for label, row in rows.items():
             print_row(name, label, row)
         worse += pose_record.finish(arguments, "wrong poses", name, rows)
+    if arguments.foreign:
+        row = measure_foreign(frames, config, datasets.open_stream(arguments.foreign))
+        label = f"frames of {arguments.foreign.stem}"
+        print_row(name, label, row)
+        worse += pose_record.finish(arguments, "foreign frames", name, {label: row})
     if arguments.relocalize:
         if arguments.map:
             state = hio.load(arguments.map)
