@@ -24,7 +24,8 @@
 some of them are at places that the map does not know. `--map` takes a saved map, for instance of
 another place. It counts right places, wrong ones that have converged, and how many are `sure`.
 
-`--wrong-poses` refines each third frame from poses that are 0.5 and 1 m off, in the map before it.
+`--wrong-poses` refines each third frame in the map before it, from poses that are 1 and 0.5 m off
+along the floor, and 0.1 and 0.2 m along z.
 `--foreign` tracks the frames of another recording in the map of the whole stream, each at a random
 pose of the stream. Given the stream itself, the pose is at least 1 m from the frame's own.
 
@@ -75,12 +76,15 @@ JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 
 MAPPED_AGAIN = 3
 GLITCH = range(60, 65)
 
-# A pose is wrong if it is farther than this from the right one, m. Tried are these shifts, m.
-WRONG_M = 0.3
+# Shifts, m, and how far from the right pose a result is wrong, m. A wrong one is sure if it is off
+# by more than this many of its standard deviations.
 SHIFTS_M = {
-    1.0: ((0.6, 0.8, 0), (-0.6, -0.8, 0), (0.8, -0.6, 0), (-0.8, 0.6, 0)),
-    0.5: ((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)),
+    "1 m off": (((0.6, 0.8, 0), (-0.6, -0.8, 0), (0.8, -0.6, 0), (-0.8, 0.6, 0)), 0.3),
+    "0.5 m off": (((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)), 0.3),
+    "0.1 m along z": (((0, 0, 0.1), (0, 0, -0.1)), 0.05),
+    "0.2 m along z": (((0, 0, 0.2), (0, 0, -0.2)), 0.05),
 }
+SURE_DEVIATIONS = 5
 
 FOREIGN_FROM_M = 1.0
 
@@ -203,29 +207,32 @@ def measure_wrong_poses(frames, config):
     state = hio.init(config, jax.random.key(0))
     right = {"tried": 0, "refused": 0}
     wrong = {
-        distance_m: {"tried": 0, "enough_inliers": 0, "taken": 0, "most_taken_m": 0.0}
-        for distance_m in SHIFTS_M
+        label: {"tried": 0, "enough_inliers": 0, "taken": 0, "wrong_sure": 0, "most_taken_m": 0.0}
+        for label in SHIFTS_M
     }
     for i, (cloud, pose) in enumerate(tqdm(frames, "mapping", leave=False)):
         if i >= 6 and i % 3 == 0:
             found, near = _refine_from(state, cloud, pose)
             right["tried"] += 1
             right["refused"] += not (near and bool(found.converged))
-            for distance_m, shifts in SHIFTS_M.items():
-                row = wrong[distance_m]
+            for label, (shifts, wrong_m) in SHIFTS_M.items():
+                row = wrong[label]
                 for shift in shifts:
                     start = np.array(pose)
                     start[:3, 3] += shift
                     found, near = _refine_from(state, cloud, start)
-                    away_m = np.linalg.norm(error(found.pose, pose)[:3])
-                    near &= away_m >= WRONG_M
+                    away = error(found.pose, pose)[:3]
+                    away_m = np.linalg.norm(away)
+                    near &= away_m >= wrong_m
                     row["tried"] += 1
                     row["enough_inliers"] += near and float(found.inliers) >= LEAST_INLIERS
                     if near and bool(found.converged):
+                        deviations = np.sqrt(away @ np.linalg.solve(found.covariance[:3, :3], away))
                         row["taken"] += 1
+                        row["wrong_sure"] += deviations > SURE_DEVIATIONS
                         row["most_taken_m"] = max(row["most_taken_m"], away_m)
         state = hio.update(state, cloud, pose)
-    return {"right": right} | {f"{distance_m:g} m off": row for distance_m, row in wrong.items()}
+    return {"right": right} | wrong
 
 
 def _refine_from(state, cloud, start):

@@ -119,7 +119,7 @@ def test_a_trajectory_is_refined_and_written(tmp_path, quick, capsys, options):
     names = "frames_registered", "frames_as_predicted", "frames_not_registered", "lost_since"
     trusted = int((~registered).sum())
     assert [metrics[name] for name in names] == [FRAMES - trusted, trusted, 0, None]
-    assert f"{FRAMES - trusted} poses were refined, 0 were not" in capsys.readouterr().out
+    assert f"{FRAMES - trusted} frames were registered, 0 were not" in capsys.readouterr().out
     # The map has no poses, from which a run could continue.
     plain = ["map", stream, "--output", str(output), "--resume", str(saved), *BOX]
     assert cli.main(plain) == 2
@@ -337,14 +337,14 @@ def test_the_prior_of_a_drift_grows_with_the_way(monkeypatch):
     [
         (["--drift", "0.01", "0.2"], "--drift needs --refine-poses"),
         (["--odometry", "--drift", "0.01", "0.2"], "--drift needs --refine-poses"),
-        (
-            ["--refine-poses", "--drift", "0.01", "0"],
-            "--drift is [0.01, 0.0], expected two numbers > 0",
-        ),
-        (
-            ["--refine-poses", "--drift", "nan", "1"],
-            "--drift is [nan, 1.0], expected two numbers > 0",
-        ),
+        *[
+            (
+                ["--refine-poses", "--drift", share, degrees],
+                f"--drift is [{float(share)}, {float(degrees)}], "
+                "expected a share of 0.0001 to 1 and 0.001 to 90 degrees per meter",
+            )
+            for share, degrees in [("0.01", "0"), ("nan", "1"), ("1e-30", "1"), ("1e30", "1e30")]
+        ],
     ],
 )
 def test_a_drift_that_means_nothing_is_refused(tmp_path, capsys, options, message):

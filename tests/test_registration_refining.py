@@ -470,6 +470,13 @@ def test_inside_jit_an_empty_cloud_keeps_the_pose(room):
     np.testing.assert_allclose(found.pose, pose, atol=1e-6)
 
 
+@pytest.mark.parametrize("cloud", [np.zeros((5, 3)), np.full((5, 3), 3e3)])
+def test_without_a_usable_return_the_covariance_says_unknown(room, cloud):
+    found = hio.refine_pose(room, cloud, np.eye(4), noise=NOISE)
+    assert not bool(found.converged)
+    np.testing.assert_allclose(found.covariance, 100**2 * np.eye(6), rtol=1e-5)
+
+
 def test_a_map_a_snapshot_and_a_baked_field_find_the_pose(sharp_map):
     cloud, pose = room_cloud(50, 3000, 0.3, (0.1, 0.05, 0.0))
     start = perturbed(pose, np.random.default_rng(7), 0.05, 3)

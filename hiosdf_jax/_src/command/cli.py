@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import math
 import os
 import signal
 import sys
@@ -175,8 +174,14 @@ def _map(options: argparse.Namespace) -> None:
         raise Failure(f"--resume cannot be combined with {tracking}: maps have no poses", BAD_INPUT)
     if options.drift is not None and not options.refine_poses:
         raise Failure("--drift needs --refine-poses", BAD_INPUT)
-    if options.drift is not None and not all(0 < each < math.inf for each in options.drift):
-        raise Failure(f"--drift is {options.drift}, expected two numbers > 0", BAD_INPUT)
+    if options.drift is not None:
+        share, degrees_per_meter = options.drift
+        if not (1e-4 <= share <= 1 and 1e-3 <= degrees_per_meter <= 90):
+            raise Failure(
+                f"--drift is {options.drift}, expected a share of 0.0001 to 1 and 0.001 to 90 "
+                "degrees per meter",
+                BAD_INPUT,
+            )
     output = options.output or _OUTPUT / (place.name if place.is_dir() else place.stem)
     check_outputs(options, output)
     if options.ground_truth is not None and not options.ground_truth.exists():

@@ -82,7 +82,7 @@ def summarize(metrics: dict[str, Any]) -> str:
         lines.append(f"{metrics['frames_skipped']} frames could not be used and were skipped")
     if "frames_registered" in metrics:
         missed = metrics["frames_not_registered"]
-        lines.append(f"{metrics['frames_registered']} poses were refined, {missed} were not")
+        lines.append(f"{metrics['frames_registered']} frames were registered, {missed} were not")
         if metrics["frames_as_predicted"]:
             lines[-1] += f", {metrics['frames_as_predicted']} of a young map are as predicted"
         if metrics["lost_since"] is not None:

@@ -11,13 +11,13 @@ import numpy as np
 from hiosdf_jax._src.change.consistency import CONFIDENT_UPDATES
 from hiosdf_jax._src.mapping.pipeline import check_and_pad, run_update
 from hiosdf_jax._src.mapping.registration.comparing import GROWING_REACH_M
-from hiosdf_jax._src.mapping.registration.equations import UNKNOWN_M
 from hiosdf_jax._src.mapping.registration.motion import distance_and_angle
 from hiosdf_jax._src.mapping.registration.refining import (
     Registration,
     checked_reach,
     refine_pose,
 )
+from hiosdf_jax._src.mapping.registration.uncertainty import unknown_covariance
 from hiosdf_jax._src.numerics.arrays import on_device
 from hiosdf_jax._src.numerics.intake import as_array, as_traced, check_pose, is_traced
 from hiosdf_jax._src.numerics.modes import plain
@@ -125,7 +125,7 @@ def track(
 
 
 def predict_pose(pose: Any, before: Any, after: Any) -> jax.Array:
-    """Applies the motion between two poses to another one.
+    """Applies the motion between two poses to another one: pose before^-1 after.
 
     With odometry these are its poses at two frames, and the refined pose of the first. With none, a
     sensor keeps its velocity: `predict_pose(pose, pose_before, pose)`.
@@ -238,7 +238,7 @@ def _register(
     # A young map may have too few surfaces to register a cloud, and would never get more.
     fused = registered | (updates < CONFIDENT_UPDATES)
     if own is None:
-        own = jnp.where(first, 0, _unknown())
+        own = jnp.where(first, 0, unknown_covariance())
     chosen = found._replace(
         pose=jnp.where(registered, found.pose, predicted),
         covariance=jnp.where(registered, found.covariance, own),
@@ -264,10 +264,5 @@ def _confirm_jit(
     flag = jnp.where(as_predicted & ~first, Flag.FUSED_AS_PREDICTED, 0).astype(jnp.uint32)
     report = report.replace(update_flags=report.update_flags | flag, flags=report.flags | flag)
     converged = decision.registered | (as_predicted & first)
-    other = _unknown() if own is None else own
+    other = unknown_covariance() if own is None else own
     return report, converged, jnp.where(converged, found.covariance, other)
-
-
-def _unknown() -> jax.Array:
-    """Returns the covariance (6, 6) of a pose of which nothing is known."""
-    return UNKNOWN_M**2 * jnp.eye(6, dtype=jnp.float32)

@@ -44,10 +44,12 @@ def save_paths(
     above, over_time = figure.subplots(1, 2)
     if given_world is not None:
         given = (given_world @ rotation)[:, :2]
-        above.plot(*given.T, color="0.6", linewidth=3, label="as given")
+        above.plot(*given.T, color="0.6", linewidth=3, label="poses of the stream")
         way_cm = 100 * np.linalg.norm(refined_world - given_world, axis=-1)
-        over_time.plot(frame, way_cm, color="0.4", label="from the given to the refined position")
-    above.plot(*refined.T, color="tab:blue", label="refined by the map")
+        over_time.plot(
+            frame, way_cm, color="0.4", label="from the stream's to the registered position"
+        )
+    above.plot(*refined.T, color="tab:blue", label="registered in the map")
     above.plot(*refined[0], "o", color="tab:green", label="start")
     if not registered.all():
         above.plot(*refined[~registered].T, "x", color="tab:red", label="not registered")

@@ -77,8 +77,7 @@ def merge(a: MapState, b: MapState, pose_a_b: Any) -> MapState:
 
     Hits, passes and the moments of patches add up, as if one map had met the rays of both. Only
     what lies in the box of `a` is added: `grow` it first. Surfaces outside are lost, as in
-    `transform`. The network of `a` is trained on the
-    merged grid.
+    `transform`. The network of `a`, or of `b` if `a` has no updates, is trained on the merged grid.
 
     Args:
         a: The map whose frame, box and configuration the result has.

@@ -37,7 +37,7 @@ from hiosdf_jax._src.mapping.registration.solving import (
     solve_coarse,
     solve_fine,
 )
-from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of
+from hiosdf_jax._src.mapping.registration.uncertainty import covariance_of, unknown_covariance
 from hiosdf_jax._src.numerics.collecting import collector_paused
 from hiosdf_jax._src.numerics.intake import (
     as_array,
@@ -119,8 +119,8 @@ def refine_pose(
             m or rad, has not converged.
         starts: Maximum number of initial poses, 1 to 5, not traced. The first is `pose`. While the
             cloud does not fit, others follow, 15 cm and 6 degrees away, or nearer with a smaller
-            reach. With a prior there are at most two, both at `pose`, the second with less trust in
-            the prior. Pass 1 to compare many poses: under `vmap` each takes as many starts as the
+            reach. With a prior there are two, both at `pose`, the second with less trust in the
+            prior. Pass 1 to compare many poses: under `vmap` each takes as many starts as the
             worst one.
 
     Returns:
@@ -202,7 +202,9 @@ def _refine(
     covariance = covariance_of(residuals, directions, fixed_anchor, rows)
 
     verdict = judge(fixed_field, fixed_rows, found)
-    usable = valid & is_rigid(found) & jnp.all(jnp.isfinite(covariance))
+    is_known = jnp.all(jnp.isfinite(covariance))
+    covariance = jnp.where(is_known, covariance, unknown_covariance())
+    usable = valid & is_rigid(found) & is_known
     if prior is None:
         # A cloud that determines hardly anything, such as a line of returns, may turn by a radian.
         is_near = jnp.maximum(*distance_and_angle(pose, found)) <= reach_m

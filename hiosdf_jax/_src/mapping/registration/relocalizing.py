@@ -95,7 +95,8 @@ class Relocalization(NamedTuple):
         score: Share of the cloud's returns that lie within 5 cm of a surface there, () float32.
         other: The best pose at another place, at least 0.5 m or 17 degrees away. If there is none,
             `best` again.
-        other_score: The same share there, or 0. If it is close to `score`, the place is ambiguous.
+        other_score: The same share there, or 0, () float32. If it is close to `score`, the place is
+            ambiguous.
     """
 
     best: Registration

@@ -38,6 +38,11 @@ _LEAST_SUMS = 512
 _LEAST_LEFT = 1e-3  # share of a direction's information that always stays
 
 
+def unknown_covariance() -> jax.Array:
+    """Returns the covariance (6, 6) of a pose of which nothing is known."""
+    return UNKNOWN_M**2 * jnp.eye(6, dtype=jnp.float32)
+
+
 def spread_of_slope(residuals: Residuals) -> jax.Array:
     """Measures the covariance of the slope, (6, 6) 1/m^2, from its parts in cells of space."""
     weighted = (residuals.weight * residuals.distance)[:, None] * residuals.jacobian
