@@ -76,4 +76,4 @@ def test_a_path_without_given_poses_is_drawn_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(Axes, "plot", note)
     path, up = np.arange(9.0).reshape(3, 3), np.array([0, 0, 1.0])
     save_paths(tmp_path / "path.png", None, path, np.ones(3, bool), np.ones(3), up)
-    assert labels == ["refined by the map", "start", "standard deviation in the map"]
+    assert labels == ["registered in the map", "start", "standard deviation in the map"]
