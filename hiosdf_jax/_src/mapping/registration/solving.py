@@ -79,10 +79,10 @@ _COARSE_INFLATION = 16.0
 # second result is kept if the mean loss, as `fits_better` counts it, is lower by more than this, up
 # to this many deviations from the prior. In a house, where a third of each frame is new, the second
 # search lowered the loss of right first results by up to 0.005, and a wrong second result bends the
-# map. Where few returns determine a direction, it lowered that of wrong first results by 0.01 to
-# 0.05 in a room, and by 0.006 at least with a LiDAR that was 10 cm too high or too low.
+# map. In a room where few returns determine a direction, it lowered that of wrong first results by
+# 0.01 to 0.05.
 _COARSE_SIGMA_M = 0.02
-_LEAST_GAIN = 0.006
+_LEAST_GAIN = 0.01
 _MOST_DEVIATIONS = 6.0
 
 # Rows are selected where surfaces may be this far off, m: those that contradict a pose that is not
