@@ -72,6 +72,11 @@ def error(pose, exact):
     return np.concatenate([pose[:3, 3] - exact[:3, 3], turn])
 
 
+def normalized_square(away, covariance):
+    """The square of an error (K,) in units of its standard deviations."""
+    return away @ np.linalg.solve(np.asarray(covariance, float), away)
+
+
 def occlude(cloud, rng):
     """Puts the returns of some columns of a camera's image nearer."""
     column = cloud[:, 0] / cloud[:, 2]
@@ -140,7 +145,7 @@ def measure_case(parts, distance_m, angle_deg, tries):
             seconds.append(time.perf_counter() - begin)
             away = error(found.pose, pose)
             errors.append([100 * np.linalg.norm(away[:3]), np.degrees(np.linalg.norm(away[3:]))])
-            squares.append(away @ np.linalg.solve(np.asarray(found.covariance, float), away))
+            squares.append(normalized_square(away, found.covariance))
             converged.append(bool(found.converged))
     distance, angle = np.transpose(errors)
     far = distance > FAR_CM

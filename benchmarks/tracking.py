@@ -48,7 +48,7 @@ from tqdm import tqdm
 
 import hiosdf_jax as hio
 from benchmarks import pose_record
-from benchmarks.registration import error, perturb
+from benchmarks.registration import error, normalized_square, perturb
 from hiosdf_jax import datasets, demo, scoring
 from hiosdf_jax._src.command.stream_poses import Tracker
 from hiosdf_jax._src.field.compiled import CompiledQueries
@@ -76,9 +76,9 @@ JITTER_COVARIANCE = np.diag(np.repeat([JITTER[0], np.radians(JITTER[1])], 3) ** 
 MAPPED_AGAIN = 3
 GLITCH = range(60, 65)
 
-# Shifts, m, and how far from the right pose a result is wrong, m. A wrong one is sure if it is off
-# by more than this many of its standard deviations.
-SHIFTS_M = {
+# Shifts of the right pose, m, and how far from it a result is wrong, m. A wrong one is sure if it
+# is off by more than this many of its standard deviations.
+WRONG_POSES = {
     "1 m off": (((0.6, 0.8, 0), (-0.6, -0.8, 0), (0.8, -0.6, 0), (-0.8, 0.6, 0)), 0.3),
     "0.5 m off": (((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)), 0.3),
     "0.1 m along z": (((0, 0, 0.1), (0, 0, -0.1)), 0.05),
@@ -208,31 +208,35 @@ def measure_wrong_poses(frames, config):
     right = {"tried": 0, "refused": 0}
     wrong = {
         label: {"tried": 0, "enough_inliers": 0, "taken": 0, "wrong_sure": 0, "most_taken_m": 0.0}
-        for label in SHIFTS_M
+        for label in WRONG_POSES
     }
     for i, (cloud, pose) in enumerate(tqdm(frames, "mapping", leave=False)):
         if i >= 6 and i % 3 == 0:
             found, near = _refine_from(state, cloud, pose)
             right["tried"] += 1
             right["refused"] += not (near and bool(found.converged))
-            for label, (shifts, wrong_m) in SHIFTS_M.items():
-                row = wrong[label]
+            for label, (shifts, wrong_m) in WRONG_POSES.items():
                 for shift in shifts:
-                    start = np.array(pose)
-                    start[:3, 3] += shift
-                    found, near = _refine_from(state, cloud, start)
-                    away = error(found.pose, pose)[:3]
-                    away_m = np.linalg.norm(away)
-                    near &= away_m >= wrong_m
-                    row["tried"] += 1
-                    row["enough_inliers"] += near and float(found.inliers) >= LEAST_INLIERS
-                    if near and bool(found.converged):
-                        deviations = np.sqrt(away @ np.linalg.solve(found.covariance[:3, :3], away))
-                        row["taken"] += 1
-                        row["wrong_sure"] += deviations > SURE_DEVIATIONS
-                        row["most_taken_m"] = max(row["most_taken_m"], away_m)
+                    _try_wrong_pose(state, cloud, pose, shift, wrong_m, wrong[label])
         state = hio.update(state, cloud, pose)
     return {"right": right} | wrong
+
+
+def _try_wrong_pose(state, cloud, pose, shift, wrong_m, row):
+    """Refines a pose from a shifted one, and adds what comes of it to the counts of a row."""
+    start = np.array(pose)
+    start[:3, 3] += shift
+    found, near = _refine_from(state, cloud, start)
+    away = error(found.pose, pose)[:3]
+    away_m = np.linalg.norm(away)
+    near &= away_m >= wrong_m
+    row["tried"] += 1
+    row["enough_inliers"] += near and float(found.inliers) >= LEAST_INLIERS
+    if near and bool(found.converged):
+        square = normalized_square(away, found.covariance[:3, :3])
+        row["taken"] += 1
+        row["wrong_sure"] += square > SURE_DEVIATIONS**2
+        row["most_taken_m"] = max(row["most_taken_m"], away_m)
 
 
 def _refine_from(state, cloud, start):
