@@ -14,7 +14,7 @@ import pytest
 from room_files import BOX, use_room_config, write_points, write_range
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.command import cli, map_stream
+from hiosdf_jax._src.command import cli, map_file, map_stream
 from hiosdf_jax._src.datasets import stream as stream_module
 
 RESULTS = ["mesh.ply", "mesh.png", "slices.png", "metrics.json"]
@@ -243,7 +243,7 @@ def test_a_full_disk_keeps_the_older_run(tmp_path, capsys, quick, monkeypatch, e
     assert not any("Traceback" in line or "Exception ignored" in line for line in lines)
     assert contents(tmp_path) == before
     # A map that cannot be written is no reason to lose scores and pictures.
-    monkeypatch.setattr(map_stream, "save_map", refuse)
+    monkeypatch.setattr(map_file, "save_map", refuse)
     assert cli.main(arguments) == 2
     assert one_line_last(capsys) == "hiosdf: map.npz: No space left on device"
     assert saved.read_bytes() == older

@@ -10,7 +10,7 @@ from room import arrays_equal
 from room_files import BOX, use_room_config, write_depth, write_points, write_range
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.command import cli, map_frames, map_stream
+from hiosdf_jax._src.command import cli, map_stream, stream_frames
 from hiosdf_jax._src.command.progress import load_map
 from hiosdf_jax._src.command.stopping import Stopping
 
@@ -36,14 +36,14 @@ def quick(monkeypatch):
 
 def interrupt(monkeypatch, frame, how):
     """Calls `how` while a frame is read, for the mapping alone."""
-    read = map_frames.read_frame
+    read = stream_frames.read_frame
 
     def read_frame(stream, index):
         if index == frame:
             how()
         return read(stream, index)
 
-    monkeypatch.setattr(map_frames, "read_frame", read_frame)
+    monkeypatch.setattr(stream_frames, "read_frame", read_frame)
 
 
 def metrics_of(folder):

@@ -65,13 +65,13 @@ sys.path.insert(0, sys.argv.pop(1))
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
 import pytest
 from room_files import use_room_config
-from hiosdf_jax._src.command import cli, map_frames
+from hiosdf_jax._src.command import cli, stream_frames
 use_room_config(pytest.MonkeyPatch())
-read = map_frames.read_frame
+read = stream_frames.read_frame
 def read_frame(stream, index):
     print("frame", index, flush=True)
     return read(stream, index)
-map_frames.read_frame = read_frame
+stream_frames.read_frame = read_frame
 sys.exit(cli.main(sys.argv[1:]))
 """
 

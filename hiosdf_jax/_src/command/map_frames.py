@@ -5,17 +5,17 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import dataclasses
-import sys
 import time
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
-from hiosdf_jax._src.command.progress import FrameDigest, Progress, SavedMap
+from hiosdf_jax._src.command.progress import Progress, SavedMap
+from hiosdf_jax._src.command.stream_frames import StoppedError, StreamFrames
 from hiosdf_jax._src.command.stream_poses import Tracker
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.datasets.stream import BadFrameError, Stream, read_frame
+from hiosdf_jax._src.datasets.stream import BadFrameError, Stream
 from hiosdf_jax._src.mapping import lifecycle, pipeline
 from hiosdf_jax._src.scoring.held_out import draw_returns
 from hiosdf_jax._src.state.pytrees import MapState
@@ -23,20 +23,6 @@ from hiosdf_jax._src.state.pytrees import MapState
 
 class NothingMappedError(Exception):
     """No frame of a stream could be mapped."""
-
-
-class StoppedError(Exception):
-    """The mapping was stopped; the message says why and where.
-
-    Attributes:
-        mapped: Whether the run has a map to show.
-    """
-
-    mapped = True
-
-
-class OtherStreamError(ValueError):
-    """The map to resume was made from other frames."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,113 +96,89 @@ def fuse_frames(
         OtherStreamError: The map to resume was made from other frames.
         StoppedError: The mapping was to end before anything was mapped.
     """
-    from tqdm import tqdm
-
     if resumed is None:
         state, before = lifecycle.init(config, key), Progress()
     else:
         state, before = resumed.state, resumed.progress
-    first, points_used, points_outside = (
-        before.next_frame,
-        before.points_used,
-        before.points_outside,
-    )
-    digest = FrameDigest()
+    frames = StreamFrames(stream, before, skip_bad_frames=skip_bad_frames, stop=stop)
+    points_used, points_outside = before.points_used, before.points_outside
     seconds, path_world, ups_world = [], [], []
     kept_world, kept_rng = [np.empty((0, 3), np.float32)], np.random.default_rng(0)
-    skipped = last_frame = 0
-    stopped = None
+    last_frame = 0
 
-    def progress(next_frame: int) -> Progress:
-        return Progress(next_frame, digest.text(), points_used, points_outside)
+    def progress() -> Progress:
+        return Progress(frames.next_frame, frames.digest(), points_used, points_outside)
 
-    def check_frames_before(next_frame: int) -> None:
-        if next_frame == first > 0 and digest.text() != before.digest:
-            raise OtherStreamError(
-                f"the map was made from other frames than the first {first} of this stream"
-            )
-
-    if first > len(stream):
-        raise OtherStreamError(
-            f"the map was made from {first} frames, but the stream has only {len(stream)}"
-        )
-    bar = tqdm(range(len(stream)), desc="mapping", unit="frame")
-    for i in bar:
-        check_frames_before(i)
-        if reason := stop():
-            stopped = StoppedError(f"{reason} after {i} of {len(stream)} frames")
-            break
-        try:
-            cloud, pose = read_frame(stream, i)
-        except BadFrameError as error:
-            if not skip_bad_frames:
-                stopped = error
-                break
-            digest.add(None, None)
-            skipped += 1
-            tqdm.write(str(error), file=sys.stderr)
-            continue
-        digest.add(cloud, pose)
-        if i in held_out:
-            if tracker is not None:
-                pose = tracker.locate(state, cloud, pose, i)
-            kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
-            continue
-        last_frame = i
-        updates = int(state.updates)
-        start = time.perf_counter()
-        if i >= first:
-            if not seconds:
-                bar.set_postfix_str("compiling")
-            if tracker is not None:
-                state, pose = tracker.fuse(state, cloud, pose, i)
-            else:
-                state = pipeline.update(state, cloud, pose)
-            jax.block_until_ready(state)
-        path_world.append(pose[:3, 3])
-        ups_world.append(up_of_frame(cloud, pose))
-        if i < first:
-            continue
-        seconds.append(time.perf_counter() - start)
-        if len(seconds) == 1:
-            return_freed_memory()
-            bar.unpause()  # the rate is that of the other frames
-        if int(state.updates) > updates:  # a refused cloud leaves the numbers of the one before it
-            points_used += int(state.report.points_used)
-            points_outside += int(state.report.points_outside)
-        if keep is not None and keep_every and len(seconds) % keep_every == 0:
-            keep(state, progress(i + 1))
-        if watch is not None:
-            watch(state, progress(i + 1), cloud, pose)
-        if i % 5 == 0:
-            loss_cm = 100 * float(state.report.sdf_loss)
-            bar.set_postfix_str(
-                f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points", refresh=False
-            )
-    else:
-        i = len(stream)
-        check_frames_before(i)
-    bar.close()
-    if not path_world or i < first:  # what was read again is no result of this run
-        if isinstance(stopped, StoppedError):
-            stopped.mapped = False
-        raise stopped or NothingMappedError(
+    with frames.bar:
+        while frame := frames.read_next():
+            i, cloud, pose = frame
+            if i in held_out:
+                if tracker is not None:
+                    pose = tracker.locate(state, cloud, pose, i)
+                kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
+                continue
+            last_frame = i
+            is_new = i >= before.next_frame
+            if is_new:
+                if not seconds:
+                    frames.bar.set_postfix_str("compiling")
+                updates, start = int(state.updates), time.perf_counter()
+                state, pose = _fuse(state, cloud, pose, i, tracker)
+                seconds.append(time.perf_counter() - start)
+                if int(state.updates) > updates:  # a refused cloud leaves the last one's numbers
+                    points_used += int(state.report.points_used)
+                    points_outside += int(state.report.points_outside)
+            path_world.append(pose[:3, 3])
+            ups_world.append(up_of_frame(cloud, pose))
+            if not is_new:
+                continue
+            if len(seconds) == 1:
+                return_freed_memory()
+                frames.bar.unpause()  # the rate is that of the other frames
+            if keep is not None and keep_every and len(seconds) % keep_every == 0:
+                keep(state, progress())
+            if watch is not None:
+                watch(state, progress(), cloud, pose)
+            if i % 5 == 0:
+                loss_cm = 100 * float(state.report.sdf_loss)
+                text = f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points"
+                frames.bar.set_postfix_str(text, refresh=False)
+    if not path_world or frames.next_frame < before.next_frame:  # nothing new was read
+        if isinstance(frames.stopped, StoppedError):
+            frames.stopped.mapped = False
+        raise frames.stopped or NothingMappedError(
             f"none of the {len(stream) - len(held_out)} frames could be mapped, "
             "expected at least one"
         )
-    up_world = np.mean(ups_world, axis=0)
-    length = np.linalg.norm(up_world)
     return Mapped(
         state=state,
         path_world=np.asarray(path_world, float),
-        up_world=up_world / length if length > 0.1 else np.array([0.0, 0.0, 1.0]),
+        up_world=_mean_direction(ups_world),
         update_seconds=np.asarray(seconds),
         last_frame=last_frame,
-        skipped=skipped,
-        stopped=stopped,
+        skipped=frames.skipped,
+        stopped=frames.stopped,
         held_out_world=np.concatenate(kept_world),
-        progress=progress(i),
+        progress=progress(),
     )
+
+
+def _fuse(
+    state: MapState, cloud: np.ndarray, pose: np.ndarray, number: int, tracker: Tracker | None
+) -> tuple[MapState, np.ndarray]:
+    """Fuses a frame, and waits for the map; returns it and the pose that was used."""
+    if tracker is not None:
+        state, pose = tracker.fuse(state, cloud, pose, number)
+    else:
+        state = pipeline.update(state, cloud, pose)
+    return jax.block_until_ready(state), pose
+
+
+def _mean_direction(directions: Sequence[np.ndarray]) -> np.ndarray:
+    """Averages unit vectors; z if they contradict each other."""
+    mean = np.mean(directions, axis=0)
+    length = np.linalg.norm(mean)
+    return mean / length if length > 0.1 else np.array([0.0, 0.0, 1.0])
 
 
 def return_freed_memory() -> None:

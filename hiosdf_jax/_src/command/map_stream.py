@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,16 +13,17 @@ import numpy as np
 
 from hiosdf_jax._src.command import report
 from hiosdf_jax._src.command.live_map import LiveMap
+from hiosdf_jax._src.command.map_file import MapFile
 from hiosdf_jax._src.command.map_frames import Mapped, fuse_frames, return_freed_memory
 from hiosdf_jax._src.command.map_scores import scores_of
-from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
+from hiosdf_jax._src.command.progress import Progress, SavedMap
 from hiosdf_jax._src.command.stream_poses import TRAJECTORY, Tracker
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.stream import Stream
 from hiosdf_jax._src.datasets.truth import GroundTruth
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.mapping import checkpoint, lifecycle
+from hiosdf_jax._src.mapping import lifecycle
 from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring import held_out
 from hiosdf_jax._src.state.pytrees import MapState, field_of
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 RESULTS = (*TRAJECTORY, "mesh.ply", "mesh.png", "slices.png", "growing.gif", "metrics.json")
 _STAGES = 12  # of the growing map, that growing.gif shows
-UNFINISHED = "checkpoint.npz"  # the map of a run that has not come to its end
 
 
 def run_stream(
@@ -102,45 +101,26 @@ def run_stream(
     """
     output = Path(output)
     start = time.perf_counter()
-    map_path = map_file(output, save_path)
-    ours = set() if resume_path is None else {Path(resume_path).resolve()}  # this run's maps
-    lost: list[OSError] = []
-
-    def write(state: MapState, progress: Progress) -> Path:
-        map_path.parent.mkdir(parents=True, exist_ok=True)
-        place = map_path.resolve()
-        if place not in ours and progress.next_frame < len(stream):
-            _set_aside(place)
-        if tracker is None:
-            save_map(map_path, SavedMap(state, progress, seed, truth is None))
-        else:
-            checkpoint.save(map_path, state)
-        ours.add(place)
-        return map_path
-
-    def keep(state: MapState, progress: Progress) -> None:
-        try:
-            write(state, progress)
-            lost.clear()
-        except OSError as error:  # no reason to lose the map in memory, or the scores and pictures
-            lost[:] = [error]
-            print(f"the map could not be written: {error}", file=sys.stderr)
-
-    surfaces: list[tuple[int, trimesh.Trimesh]] = []
-    due = set(np.rint(np.linspace(0, len(stream) - 1, _STAGES)).astype(int).tolist())
-    fused = 0
+    map_file = MapFile(
+        output,
+        save_path,
+        resume_path=resume_path,
+        frames=len(stream),
+        seed=seed,
+        held_out=truth is None,
+        with_progress=tracker is None,
+    )
+    growing = _Growing(len(stream), config.voxel_size) if draw_growing else None
+    kept = held_out.held_out_frames(len(stream)) if truth is None else range(0)
 
     def watch(state: MapState, progress: Progress, cloud: np.ndarray, pose: np.ndarray) -> None:
-        nonlocal fused
-        fused += 1
-        if draw_growing and progress.next_frame - 1 in due:
-            surfaces.append((fused, extract_mesh(field_of(state), config.voxel_size)))
+        if growing is not None:
+            growing.watch(state, progress)
         if live is not None:
             live.watch(state, progress, cloud, pose)
 
     if live is not None:
-        live.begin(write, stop)
-    kept = held_out.held_out_frames(len(stream)) if truth is None else range(0)
+        live.begin(map_file.write, stop)
     mapped = fuse_frames(
         stream,
         config,
@@ -148,77 +128,67 @@ def run_stream(
         held_out=kept,
         skip_bad_frames=skip_bad_frames,
         resumed=resumed,
-        keep=keep,
+        keep=map_file.keep,
         keep_every=checkpoint_every,
         stop=stop,
         tracker=tracker,
         watch=watch,
     )
     if save_path is not None or mapped.stopped is not None:
-        keep(mapped.state, mapped.progress)
+        map_file.keep(mapped.state, mapped.progress)
     queries = CompiledQueries(lifecycle.snapshot(mapped.state))
     if live is not None:
         live.finish(queries.field)
-    scores = {}
+    described = report.describe(mapped, config) | {"stream": name, "seed": seed}
     if truth is not None:
-        scores = _score(queries, mapped, truth)
+        described |= _score(queries, mapped, truth)
     elif kept:
         returns_world = mapped.held_out_world
-        scores["held_out"] = held_out.score_held_out(queries.sdf, queries.observed, returns_world)
+        score = held_out.score_held_out(queries.sdf, queries.observed, returns_world)
+        described["held_out"] = score
     return_freed_memory()
-    also = "growing.gif, " if draw_growing else ""
+    also = "growing.gif, " if growing is not None else ""
     print(f"drawing {also}slices.png, mesh.ply and mesh.png", flush=True)
-    described: dict[str, Any] = {}
     with replacing_together(output, RESULTS) as folder:
         up_world = drawing.draw_map(folder, queries, exact_sdf, mapped.path_world, mapped.up_world)
-        if surfaces:
-            before = len(mapped.path_world) - fused  # positions of the run that this one continues
-            stages = [Stage(mesh, mapped.path_world[: before + k]) for k, mesh in surfaces]
-            save_growing(folder / "growing.gif", stages, up_world)
-        described = report.describe(mapped, config) | {"stream": name, "seed": seed} | scores
+        if growing is not None:
+            growing.save(folder / "growing.gif", mapped.path_world, up_world)
         described["up_world"] = up_world.tolist()
         if tracker is not None:
             described |= tracker.counts()
             tracker.write(folder, up_world)
         described["total_s"] = time.perf_counter() - start
         report.write_json(folder / "metrics.json", described)
+    error = map_file.error or mapped.stopped
+    if error is None:
+        map_file.remove_unfinished()
     print(report.summarize(described))
     print(f"wrote {output}{os.sep} in {described['total_s']:.0f} s")
-    if lost:
-        raise lost[0]
-    if mapped.stopped is not None:
-        raise mapped.stopped
-    unfinished = output / UNFINISHED
-    if save_path is None or map_path.resolve() != unfinished.resolve():
-        if unfinished.resolve() in ours:
-            unfinished.unlink(missing_ok=True)
-        elif unfinished.exists():
-            print(f"{unfinished} is of an earlier run that was stopped")
+    if error is not None:
+        raise error
     return described
 
 
-def map_file(output: Path, save_path: str | os.PathLike[str] | None) -> Path:
-    """Where a run writes its map while it has not come to its end.
+class _Growing:
+    """Meshes of the growing map, for `growing.gif`."""
 
-    Args:
-        output: The folder of the results.
-        save_path: Where the map of a run that comes to its end is written, if anywhere.
+    def __init__(self, frames: int, resolution: float) -> None:
+        self._due = set(np.rint(np.linspace(0, frames - 1, _STAGES)).astype(int).tolist())
+        self._resolution = resolution
+        self._fused = 0
+        self._meshes: list[tuple[int, trimesh.Trimesh]] = []
 
-    Returns:
-        The file.
-    """
-    return output / UNFINISHED if save_path is None else Path(save_path)
+    def watch(self, state: MapState, progress: Progress) -> None:
+        self._fused += 1
+        if progress.next_frame - 1 in self._due:
+            mesh = extract_mesh(field_of(state), self._resolution)
+            self._meshes.append((self._fused, mesh))
 
-
-def _set_aside(path: Path) -> None:
-    """Renames a map of another run, which a map that is not finished would replace."""
-    if not path.is_file():
-        return
-    number = 1
-    while (aside := path.with_stem(f"{path.stem}.{number}")).exists():
-        number += 1
-    path.rename(aside)
-    print(f"{path} is of another run: kept as {aside.name}")
+    def save(self, path: Path, path_world: np.ndarray, up_world: np.ndarray) -> None:
+        if self._meshes:
+            before = len(path_world) - self._fused  # positions of the run that this one continues
+            stages = [Stage(mesh, path_world[: before + k]) for k, mesh in self._meshes]
+            save_growing(path, stages, up_world)
 
 
 def _score(queries: CompiledQueries, mapped: Mapped, truth: GroundTruth) -> dict[str, Any]:

@@ -12,7 +12,8 @@ from hiosdf_jax._src.output_files import check_output, check_output_folder
 
 def check_outputs(options: argparse.Namespace, output: Path) -> None:
     """Raises a failure for outputs that cannot be written, before any work."""
-    from hiosdf_jax._src.command.map_stream import RESULTS, UNFINISHED
+    from hiosdf_jax._src.command.map_file import UNFINISHED
+    from hiosdf_jax._src.command.map_stream import RESULTS
 
     check_folder(options, output, (*RESULTS, UNFINISHED))
     if options.export is not None:

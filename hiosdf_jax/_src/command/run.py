@@ -32,11 +32,9 @@ def run_mapping(
 ) -> None:
     """Maps, scores and draws; turns what ends the mapping into a failure or a hint to resume."""
     from hiosdf_jax._src.command import map_stream
-    from hiosdf_jax._src.command.map_frames import (
-        NothingMappedError,
-        OtherStreamError,
-        StoppedError,
-    )
+    from hiosdf_jax._src.command.map_file import path_of_map
+    from hiosdf_jax._src.command.map_frames import NothingMappedError
+    from hiosdf_jax._src.command.stream_frames import OtherStreamError, StoppedError
     from hiosdf_jax._src.datasets.stream import BadFrameError
 
     if truth is not None and not (truth.frame < len(stream)).any():
@@ -75,7 +73,7 @@ def run_mapping(
         if settings.get("tracker") is not None:
             print(f"stopped by {stop}")
         else:
-            map_path = str(map_stream.map_file(output, options.save))
+            map_path = str(path_of_map(output, options.save))
             command, *rest = _without_resume(options.arguments)
             again = shlex.join(["hiosdf", command, "--resume", map_path, *rest])
             print(f"stopped by {stop}; to resume:\n  {again}")
