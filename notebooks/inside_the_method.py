@@ -151,7 +151,7 @@ print("of the grid:", int(from_grid.weight.sum()), "of the cloud:", int(from_clo
 # %% [markdown]
 # ## The training
 # A few gradient steps per update lower the mean |f - s| of the samples (the paper's equation 4) and
-# the mean deviation of the gradient's norm from 1 (equation 5). The network is never trained anew:
+# the mean deviation of the gradient's norm from 1 (equation 5). The network never starts over:
 # an update continues with the weights of the last one. The losses rise after the fifth update, with
 # which the warm-up of more epochs ends, and while the kitchen comes into view, which is new to the
 # network. Then they fall again.
@@ -202,7 +202,7 @@ plt.show()
 # still wrong in the kitchen, on which few updates have trained it. The blend is the grid's answer
 # with a tenth of the network's correction. It fades to the network beyond the grid's horizon and in
 # unseen space. Around the column all three are too far: no cloud has shown its other side yet.
-# [The benchmarks](../benchmarks/README.md#accuracy) leave out each other part in turn: local
+# [The benchmarks](../benchmarks/README.md#accuracy) leave out the other parts in turn: local
 # samples, carving, the Eikonal loss.
 #
 # Continue with [planning on a map](planning.ipynb).

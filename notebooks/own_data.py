@@ -35,7 +35,7 @@ from hiosdf_jax import datasets, demo, exports, pictures, scoring
 # %% [markdown]
 # ## A recording
 # Depth images of 16 bits in mm, the camera's intrinsics, and a pose for each image. Here they are
-# simulated; replace this cell by your own files.
+# simulated; replace this cell with your own files.
 
 # %%
 folder = Path(tempfile.mkdtemp())

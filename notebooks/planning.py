@@ -115,7 +115,7 @@ plt.show()
 # In space that no ray has reached, the network guesses. This is a line from seen into unseen space,
 # in the early map: the guess is too large. `unknown="obstacle"` is never more than the distance to
 # unseen space, and negative inside. It is the default of `hiosdf_jax.planning`. `lower` is a bound
-# of the distance, which each cloud calibrates anew.
+# of the distance that each cloud recalibrates.
 
 # %%
 line = np.stack([np.linspace(2.5, 5.6, 200), np.full(200, 3.3), np.full(200, 1.2)], axis=-1)

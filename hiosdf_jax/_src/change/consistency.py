@@ -66,7 +66,7 @@ class Verdict(NamedTuple):
 
     Attributes:
         consistent: The cloud agrees with the map, or the map cannot judge it, () bool.
-        noise: It does not, and its rays disagree with each other, () bool: it is no view of any
+        noise: It does not, and its rays disagree with each other, () bool: it is not a view of any
             world.
     """
 

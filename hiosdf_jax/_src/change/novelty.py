@@ -30,7 +30,7 @@ class Novelty(NamedTuple):
         novel: The return is in space that was free, (N,) bool.
         near_new: The return is on or next to a surface that is itself new, (N,) bool.
         consistent: The cloud agrees with the map, or the map cannot judge it, () bool.
-        noise: It does not, and it is no view of any world, () bool.
+        noise: It does not, and its rays disagree with each other, () bool.
     """
 
     novel: jax.Array

@@ -10,15 +10,15 @@ from hiosdf_jax._src.command.progress import Progress, SavedMap, save_map
 from hiosdf_jax._src.mapping import checkpoint
 from hiosdf_jax._src.state.pytrees import MapState
 
-UNFINISHED = "checkpoint.npz"  # the map of a run that has not come to its end
+UNFINISHED = "checkpoint.npz"  # the map of a run that has not finished
 
 
 def path_of_map(output: Path, save_path: str | os.PathLike[str] | None) -> Path:
-    """Returns the file to which a run writes its map while it has not come to its end.
+    """Returns the file to which a run writes its map until it has finished.
 
     Args:
         output: The folder of the results.
-        save_path: Where the map of a run that comes to its end is written, if anywhere.
+        save_path: Where the map of a finished run is written, if anywhere.
 
     Returns:
         The file.

@@ -76,7 +76,7 @@ def run_stream(
         exact_sdf: Maps (n, 3) points, m, world frame, to (n,) exact distances, m; drawn beside the
             map.
         save_path: Where to write the map itself, see `hiosdf_jax.load`. By default it is written
-            to `checkpoint.npz` in the folder, and only while the run has not come to its end.
+            to `checkpoint.npz` in the folder, and only until the run has finished.
         skip_bad_frames: Skip bad frames and count them.
         resumed: The map to continue; of the same configuration and seed.
         resume_path: Its file, which this run may replace and, at its end, remove. A map of another

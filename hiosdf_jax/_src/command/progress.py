@@ -93,7 +93,7 @@ def load_map(path: str | os.PathLike[str]) -> SavedMap:
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: The file is no map, or does not say how far it has come.
+        ValueError: The file is not a map, or does not say how far it has come.
     """
     state = checkpoint.load(path)
     notes = checkpoint.read_progress(path)

@@ -55,7 +55,7 @@ class Archive:
         Raises:
             FileNotFoundError: There is no such file.
             IsADirectoryError: It is a folder.
-            ValueError: It is no such file, has an entry twice, or one that is encrypted or
+            ValueError: It is not such a file, has an entry twice, or one that is encrypted or
                 compressed in a way that numpy does not write. The message names the file.
         """
         self.path = path

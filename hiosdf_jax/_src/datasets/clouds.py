@@ -93,7 +93,7 @@ def _sorted(clouds: list[Path]) -> list[Path]:
     """Sorts clouds by the times that are their names, or else by the numbers in their names."""
     clouds = sorted(clouds, key=lambda path: (_natural(path), path.name))
     stamps = np.array([_stamp(path) for path in clouds])
-    # Versions such as 1.1 and 1.10 are no times.
+    # Versions such as 1.1 and 1.10 are not times.
     if np.isfinite(stamps).all() and len(np.unique(stamps)) == len(stamps):
         return [clouds[i] for i in np.argsort(stamps)]
     return clouds

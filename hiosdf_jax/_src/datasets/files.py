@@ -79,9 +79,9 @@ def read_lines(path: _Path) -> Iterator[tuple[int, str]]:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no regular file, or a line is too long; the message names the file.
+        ValueError: It is not a regular file, or a line is too long; the message names the file.
     """
-    # Bytes that are not UTF-8 are no number either, and are reported as such.
+    # Bytes that are not UTF-8 are not a number either, and are reported as such.
     with io.TextIOWrapper(open_regular(path), encoding="utf-8", errors="replace") as file:
         for line in itertools.count(1):
             text = file.readline(_LONGEST_LINE)

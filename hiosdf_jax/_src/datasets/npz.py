@@ -67,7 +67,7 @@ class NpzStream:
         Raises:
             FileNotFoundError: There is no such file.
             NoPosesError: The file has no poses.
-            ValueError: The file is no npz file, or another key is missing, misshapen or out of
+            ValueError: The file is not an npz file, or another key is missing, misshapen or out of
                 range; the message names the file, the key, what was found and what was expected.
         """
         self.path = path
@@ -216,7 +216,7 @@ def read_truth(path: str | os.PathLike[str]) -> GroundTruth | None:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is no npz file, or some of the keys are missing or misshapen.
+        ValueError: The file is not an npz file, or some of the keys are missing or misshapen.
 
     Example:
         truth = datasets.read_truth("house_depth.npz")

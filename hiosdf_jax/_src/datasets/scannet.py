@@ -68,7 +68,7 @@ def _check_once(images: list[tuple[int, Path]]) -> None:
     for (number, image), (other, twin) in itertools.pairwise(images):
         if number == other:
             raise ValueError(
-                f"{image}: is frame {number}, as is {twin.name}, expected one image for a frame"
+                f"{image}: is frame {number}, as is {twin.name}, expected one image per frame"
             )
 
 

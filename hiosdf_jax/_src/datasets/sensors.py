@@ -21,7 +21,7 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
     """Converts depth images of a pinhole camera to clouds.
 
     Args:
-        depth: (..., H, W) m along the optical axis; 0, negative, NaN or inf is no return.
+        depth: (..., H, W) m along the optical axis; 0, negative, NaN or inf means no return.
         intrinsics: (3, 3) pinhole matrix K in pixels, with pixel centers at integer coordinates.
 
     Returns:
@@ -29,8 +29,8 @@ def depth_to_cloud(depth: ArrayLike, intrinsics: ArrayLike) -> Array:
         for no return.
 
     Raises:
-        ValueError: Depth has fewer than two dimensions, or intrinsics is no pinhole matrix. Inside
-            jit only its shape is checked.
+        ValueError: Depth has fewer than two dimensions, or intrinsics is not a pinhole matrix.
+            Inside jit only its shape is checked.
 
     Example:
         depth = depth_mm / 1000.0  # (480, 640) m; 0 is not a return
@@ -86,7 +86,7 @@ def ranges_to_cloud(ranges: ArrayLike, directions: ArrayLike) -> Array:
     """Converts one scan of a LiDAR to a cloud.
 
     Args:
-        ranges: (...) m along each ray; 0, negative, NaN or inf is no return.
+        ranges: (...) m along each ray; 0, negative, NaN or inf means no return.
         directions: (..., 3) unit directions of the rays, sensor frame.
 
     Returns:

@@ -113,7 +113,7 @@ class FrameStream:
         self.stamps = None if stamps is None else np.asarray(stamps, float)
         if self.stamps is not None and self.stamps.shape != (count,):
             raise ValueError(
-                f"{path}: stamps has shape {self.stamps.shape}, expected ({count},), one a frame"
+                f"{path}: stamps has shape {self.stamps.shape}, expected ({count},), one per frame"
             )
         self._count, self._read = count, read
 
@@ -157,7 +157,7 @@ def frame_index(index: int, count: int, path: str | os.PathLike[str]) -> int:
 
     Raises:
         IndexError: Index is out of range. It also ends a plain `for cloud, pose in stream`.
-        TypeError: It is no whole number, such as a slice.
+        TypeError: It is not a whole number, for example a slice.
     """
     if not isinstance(index, numbers.Integral):
         raise TypeError(f"{path}: frame {index!r}, expected a whole number")
@@ -226,7 +226,7 @@ def find_bounds(stream: Stream, margin: float = 0.3, *, skip_bad_frames: bool = 
 
     Raises:
         BadFrameError: A frame is bad and `skip_bad_frames` is False.
-        ValueError: Margin is no number, or negative; or no frame is usable.
+        ValueError: Margin is not a number, or is negative; or no frame is usable.
 
     Example:
         extent = datasets.find_bounds(stream)

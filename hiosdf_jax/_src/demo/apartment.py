@@ -132,7 +132,7 @@ class ApartmentStream:
         model: The apartment, `mujoco.MjModel`.
         poses_world_sensor: (frames, 4, 4) float64 T_world_sensor, m.
         camera: The depth camera.
-        max_range: Most range of a return, m.
+        max_range: Largest range of a return, m.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class ApartmentStream:
             frames: Length of the stream. The path does not depend on it, see `camera_path`.
             width: Pixels per row.
             height: Pixels per column.
-            max_range: Most range of a return, m. The least is 0.3 m.
+            max_range: Largest range of a return, m. The least is 0.3 m.
             seed: Seed of the noise.
             noise: Whether depths have a Kinect's noise, some pixels drop out, and some fly between
                 foreground and background at depth edges.

@@ -63,7 +63,7 @@ def save_picture(path: str | os.PathLike[str], run: Run) -> None:
     )
     rows[0].supxlabel(
         "gray: not seen; dull: not seen at all heights of the body; black: surfaces in the map; "
-        "green: driven; magenta: the way it means to go; orange: rollouts; star: goal",
+        "green: driven; magenta: planned path; orange: rollouts; star: goal",
         fontsize=10,
     )
     _draw_clearance(rows[1].subplots(), run)

@@ -1,4 +1,4 @@
-"""Every voxel's nearest surface patch, its side of it, and the distance."""
+"""Every voxel's nearest surface patch, the distance to it, and the side on which the voxel lies."""
 
 from __future__ import annotations
 

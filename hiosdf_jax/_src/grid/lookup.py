@@ -98,7 +98,7 @@ def nearest_patch_at(
         surface: The grid's surface.
         point: (...) m each.
         side_point: The same points, if the derivative by `point` shall hold the sides of space
-            fixed: where they change, the slope of the distance is no normal of a surface.
+            fixed: where they change, the slope of the distance is not the normal of a surface.
 
     Returns:
         As `nearest_patch`.

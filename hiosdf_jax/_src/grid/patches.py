@@ -28,7 +28,7 @@ EXTENT_DEVIATIONS = 0.9 * 3**0.5
 # Shorter axes (voxels) are stored with this length, so that a perfect plane keeps its normal.
 _LEAST_DEVIATION = 1e-3
 
-# What two patches of one voxel may become, voxels; a longer axis is no axis to `load`.
+# What two patches of one voxel may become, voxels; `load` refuses a longer axis.
 _LONGEST_DEVIATION = 0.99
 
 # The direction of shorter axes (voxels; twice the least) is rounding noise.

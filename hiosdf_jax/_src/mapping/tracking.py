@@ -164,8 +164,8 @@ def _predict_pose(pose: jax.Array, before: jax.Array, after: jax.Array) -> jax.A
 
     way = times(back, after[:3, 3] - before[:3, 3])
     rotation = times(turn, times(back, after[:3, :3]))
-    # One step toward the nearest rotation: a transpose is no inverse of a matrix that has drifted,
-    # and extrapolation would more than double the drift each time.
+    # One step toward the nearest rotation: a transpose is not the inverse of a matrix that has
+    # drifted, and extrapolation would more than double the drift each time.
     rotation = times(
         rotation, 1.5 * jnp.eye(3, dtype=jnp.float32) - 0.5 * times(rotation.T, rotation)
     )
@@ -212,7 +212,7 @@ class _Decision(NamedTuple):
 
     Attributes:
         registered: The map determined the pose, () bool.
-        as_predicted: The cloud is fused although it did not, () bool.
+        as_predicted: The cloud is fused although the map did not determine the pose, () bool.
         updates_if_fused: Number of updates after the cloud is fused, () int32.
         flags: Flags of `Flag` that this raises, () uint32.
     """

@@ -37,8 +37,8 @@ def describe(value: Any, indent: int = 0) -> str:
         indent: Columns before the lines after the first one.
 
     Returns:
-        The text. Of arrays it has the type and the shape, of scalars the value where it is known,
-        of dataclasses that are no pytree, such as `Config`, the fields that are not the default.
+        The text. It has the type and shape of arrays, the value of scalars where it is known, and,
+        for dataclasses that are not pytrees, such as `Config`, the fields that are not the default.
     """
     parts = _parts(value)
     if parts is None:

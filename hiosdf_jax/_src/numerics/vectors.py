@@ -35,8 +35,8 @@ def take(table: Any, rows: jax.Array, first: int = 0) -> Vector:
     """Gathers vectors from the rows of a table (N, M), from column `first` on.
 
     Args:
-        table: Fewer than 2^31 numbers; floats become float32, integers int32. A table in a kernel
-            of ours, `point_kernel`, gathers in its own way.
+        table: Fewer than 2^31 numbers; floats become float32, integers int32. A table in one of
+            our kernels (`point_kernel`) gathers in its own way.
         rows: Row indices, (...).
         first: Column of the first component.
 

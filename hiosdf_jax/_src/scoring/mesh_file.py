@@ -37,7 +37,7 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no such file, has no triangle, or a corner that is not finite or is not
+        ValueError: It is not such a file, has no triangle, or a corner that is not finite or is not
             there. The message names the file.
     """
     import trimesh

@@ -23,7 +23,7 @@ def write_csv(path: str | os.PathLike[str], metrics: dict[str, Any]) -> None:
             members of lists are numbered, and None becomes an empty value.
 
     Raises:
-        ValueError: `metrics` is no dict.
+        ValueError: `metrics` is not a dict.
         OSError: The file cannot be written.
     """
     if not isinstance(metrics, dict):

@@ -196,7 +196,7 @@ def grid_scene(folder: str | os.PathLike[str]) -> Scene:
     """Takes distances from a grid of samples, as iSDF stores its ground truth for ReplicaCAD.
 
     Distances are interpolated trilinearly between samples. Gradients are central differences over
-    two steps of the grid. A sample of exactly 0 is no data.
+    two steps of the grid. A sample of exactly 0 means no data.
 
     Args:
         folder: The folder with `sdf.npy`, (X, Y, Z) m, positive in free space, and `transform.txt`,

@@ -63,7 +63,7 @@ class BackgroundMapper:
     where `age(now)` is too large, or `failure` is not None.
 
     Attributes:
-        field: The newest snapshot, or what `serve` has made of it, with the stamp of its frame.
+        field: The newest snapshot, or the result of `serve` for it, with the stamp of its frame.
         serve: Function applied to each snapshot; its result becomes `field`. It may be replaced at
             any time, for instance to move a window with the robot. The next fused frame uses it.
         dropped: Number of frames that newer ones replaced.
@@ -93,7 +93,7 @@ class BackgroundMapper:
             process: Whether to map in a process of its own.
 
         Raises:
-            ValueError: `state` is not a map, or `serve` is no such function.
+            ValueError: `state` is not a map, or `serve` is not such a function.
         """
         check_map(state)
         if not isinstance(process, bool):

@@ -16,7 +16,7 @@ from hiosdf_jax._src.state.flags import Flag
 from hiosdf_jax._src.state.pytrees import Baked, Field, MapState, field_of
 
 type Serve = Callable[[Field], Field | Baked] | None
-"""What makes the field that controllers read of each snapshot; None for the snapshot itself."""
+"""Turns each snapshot into the field that controllers read; None for the snapshot itself."""
 
 # What `update` raises for a bad frame: the others are faults of the machine or of this library.
 # Warnings are raised where the user has made them errors.
@@ -108,7 +108,7 @@ class Fuser:
 
 
 def publish(state: MapState, serve: Serve, stamp: float = -math.inf) -> Published:
-    """Makes of a map what controllers read.
+    """Computes what controllers read from a map.
 
     Args:
         state: The map.

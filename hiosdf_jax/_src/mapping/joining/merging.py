@@ -59,8 +59,8 @@ def transform(state: MapState, pose: Any, bounds: Any = None) -> MapState:
         not rigid counts as the identity and raises `Flag.BAD_POSE`.
 
     Raises:
-        ValueError: `state` is not a map, or `bounds` is no box. Outside jit also: the pose is not
-            finite or not rigid.
+        ValueError: `state` is not a map, or `bounds` is not a box. Outside jit also: the pose is
+            not finite or not rigid.
 
     Example:
         >>> moved = hio.transform(state, pose)
@@ -124,7 +124,7 @@ def correct(submaps: Sequence[MapState], poses: Any, bounds: Any = None) -> MapS
 
     Raises:
         ValueError: There is no submap, one is not a map, the configurations do not fit, there are
-            not as many poses as submaps, or `bounds` is no box. Outside jit also: a pose is not
+            not as many poses as submaps, or `bounds` is not a box. Outside jit also: a pose is not
             finite or not rigid.
 
     Example:

@@ -247,7 +247,7 @@ def find_step(
         anchor: As for `balance`.
         rows: As for `balance`.
         pose: As for `balance`.
-        inflation: How many returns tell as much as one independent one would.
+        inflation: How many returns are worth one independent return.
         damping: Added to the diagonal of the information, as a share of its mean.
 
     Returns:

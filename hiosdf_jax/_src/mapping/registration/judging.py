@@ -57,7 +57,7 @@ class Verdict(NamedTuple):
     Attributes:
         residual: Root mean square distance of the inliers from the surface, () m.
         inliers: Share of the returns in observed space that lie on a surface, ().
-        fits: The pose can be trusted as far as the returns tell, () bool.
+        fits: The returns support the pose, () bool.
     """
 
     residual: jax.Array

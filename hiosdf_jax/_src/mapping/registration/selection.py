@@ -59,8 +59,8 @@ def are_returns(square_ranges: Any, least_range_m: float) -> Any:
     """Returns a mask of the rows that are returns.
 
     Args:
-        square_ranges: (N,) m^2; what is not finite is no return, nor is a range above 100 km.
-        least_range_m: Nearer rows are no returns.
+        square_ranges: (N,) m^2; values that are not finite and ranges above 100 km are not returns.
+        least_range_m: Nearer rows do not count as returns.
 
     Returns:
         (N,) bool.
@@ -108,7 +108,7 @@ def take_evenly_on_device(cloud: jax.Array, least_range_m: Any, count: int) -> j
 
     Args:
         cloud: (N, 3) m, N at least `count`.
-        least_range_m: Nearer rows are no returns.
+        least_range_m: Nearer rows do not count as returns.
         count: Most rows to select.
 
     Returns:

@@ -83,7 +83,7 @@ def smooth_poses(
         result = fit_chain(start, known, given, weights, np.repeat(deviation, 3))
     except ValueError as error:  # also numpy's LinAlgError
         raise ValueError(
-            f"motion_deviation is {motion_deviation!r}, expected more beside such a covariance: "
+            f"motion_deviation is {motion_deviation!r}, expected larger ones for this covariance: "
             "the normal equations are singular"
         ) from error
     return result.astype(np.float32)

@@ -257,7 +257,7 @@ class Solution(NamedTuple):
         pose: (4, 4).
         residuals: The returns at this pose.
         rests: The steps have come to rest, () bool.
-        inflation: How many returns tell as much as one independent one would, ().
+        inflation: How many returns are worth one independent return, ().
     """
 
     pose: jax.Array

@@ -55,7 +55,7 @@ def spread_of_slope(residuals: Residuals) -> jax.Array:
 
 
 def inflation_of(residuals: Residuals, directions: Directions) -> jax.Array:
-    """Computes how many returns tell as much as one independent one would, at least 1."""
+    """Computes how many returns are worth one independent return, at least 1."""
     spread = jnp.diag(in_basis(spread_of_slope(residuals), directions))
     information = jnp.diag(in_basis(information_of(residuals), directions))
     ratio = spread / jnp.maximum(information, 1e-30)
@@ -105,6 +105,6 @@ def _jackknife(residuals: Residuals, directions: Directions, rows: Rows) -> jax.
     occupied = sums[:, 42] > 0
     count = jnp.maximum(jnp.sum(occupied), 1).astype(jnp.float32)
     share = (count - 1) / count
-    # With a prior the returns alone have a slope, which is no spread.
+    # With a prior the returns alone have a slope, which is not a spread.
     motion = jnp.where(occupied[:, None], motion - jnp.sum(motion, axis=0) / count, 0)
     return share * jnp.matmul(motion.T, motion, precision="highest")

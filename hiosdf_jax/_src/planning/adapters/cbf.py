@@ -29,7 +29,7 @@ def velocity_filter(
     unknown: Unknown = "obstacle",
     bound: Bound = "sdf",
 ) -> Callable[[AnyField, jax.Array, jax.Array], jax.Array]:
-    """Makes a filter that changes velocity commands as little as keeps the body off the map.
+    """Makes a filter that changes velocity commands just enough to keep the body off the map.
 
     With h_i = sdf(center_i) - radius_i - margin for every sphere i of the body, the filter returns
     the velocity nearest to the desired one, in units of the limits, among those within the limits

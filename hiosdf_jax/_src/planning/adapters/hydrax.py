@@ -53,7 +53,7 @@ def optimizer(
         (state, params, field) -> new params, rollouts; as `controller.optimize`.
 
     Raises:
-        ValueError: `controller` is no controller of hydrax.
+        ValueError: `controller` is not a controller of hydrax.
     """
     if not isinstance(controller, SamplingBasedController):
         raise ValueError(

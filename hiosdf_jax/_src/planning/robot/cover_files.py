@@ -57,7 +57,7 @@ def read_covers(path: _Path, key: str, count: int) -> list[SphereCover] | None:
         return None
     with Archive(path) as archive:
         if archive.names != _NAMES or str(archive.read("format")) != _FORMAT:
-            raise ValueError(f"{os.fspath(path)} holds no covers, expected another name of a file")
+            raise ValueError(f"{os.fspath(path)} holds no covers, expected another file name")
         if str(archive.read("key")) != key:
             return None
         counts, centers, radii = map(archive.read, ("counts", "centers_body", "radii"))
@@ -70,7 +70,7 @@ def read_covers(path: _Path, key: str, count: int) -> list[SphereCover] | None:
         and ((radii > 0) & np.isfinite(radii)).all()
     )
     if not is_cover:
-        raise ValueError(f"{os.fspath(path)} holds covers that are damaged, expected to remove it")
+        raise ValueError(f"{os.fspath(path)} holds covers that are damaged; remove the file")
     rows = np.cumsum(counts)[:-1]
     return list(zip(np.split(centers, rows), np.split(radii, rows), strict=True))
 

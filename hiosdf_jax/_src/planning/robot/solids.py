@@ -208,6 +208,6 @@ def _on_triangles(triangles: np.ndarray, error: float) -> np.ndarray:
 
 
 def _repeated(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each index as often as it counts, and 0, 1, ... for each."""
+    """Repeats each index as often as its count says, and numbers the repetitions from 0."""
     index = np.repeat(np.arange(len(counts)), counts)
     return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -75,7 +75,7 @@ def spheres_from_model(
     """Covers geoms of a robot by spheres that protrude by at most a tolerance.
 
     The cover is complete. A mesh is covered as it is, with all that it encloses, not as the convex
-    hull that MuJoCo collides. Half the tolerance takes about four times as many spheres. Not inside
+    hull that MuJoCo checks. Half the tolerance takes about four times as many spheres. Not inside
     jit. Meshes take seconds: a bar in the terminal shows the progress, and `cache` keeps the
     result.
 

@@ -62,7 +62,7 @@ def costmap(
         floor_m: Height of the floor, m, world frame.
         height_m: Height of the robot, m.
         radius_m: Radius of the robot, m.
-        step_m: Surfaces up to this height above the floor are no obstacles, m; at least
+        step_m: Surfaces up to this height above the floor are not obstacles, m; at least
             the resolution, or the floor itself would be an obstacle.
         resolution: Edge of a cell, m.
 
