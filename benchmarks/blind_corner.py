@@ -23,7 +23,7 @@ import numpy as np
 import hiosdf_jax as hio
 from benchmarks import records
 from hiosdf_jax._src.demo.driver import Driver, head, make_driver, make_task
-from hiosdf_jax._src.demo.geodesic import lay_plane
+from hiosdf_jax._src.demo.geodesic import lay_floor
 from hiosdf_jax._src.demo.robot import Robot, motion
 
 HEIGHT = 0.6  # m, of the corridor
@@ -127,7 +127,7 @@ def run(scene: Scene, seed: int, unknown: str, driver: Driver) -> dict[str, obje
     """Drives to the goal once."""
     rng = np.random.default_rng((seed, 1))
     directions = lidar_directions()
-    plane = lay_plane(BOUNDS, 0.1)
+    plane = lay_floor(BOUNDS, 0.1)
     map_state = hio.init(map_config(), jax.random.key(seed))
     state = jnp.array([*scene.start, 0.0, 0.0, 0.0])
     plan, states = driver.plan, [np.asarray(state)[None]]

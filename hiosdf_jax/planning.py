@@ -81,8 +81,6 @@ _REPOSITORIES = {
 
 def __getattr__(name: str) -> ModuleType:
     """Imports an adapter on first use."""
-    if name == "trajectory":
-        return importlib.import_module("hiosdf_jax._src.planning.trajectory")
     if name not in _ADAPTERS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

@@ -5,12 +5,18 @@ import numpy as np
 import pytest
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.network import evaluation
+from hiosdf_jax._src.network import evaluation, loss
 from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.samples.draw import Samples
 
 BOUNDS = ((-1, -1, -1), (1, 1, 1))
 TINY = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, batches=1, eikonal_every=1)
+
+
+def mean_losses(config, params, points, samples):
+    """The means of both losses over the samples with weight."""
+    weights = loss.weights(config, samples)
+    return loss.means(loss.sums(config, params, points, samples), weights)
 
 
 def numpy_forward(config, params, points):

@@ -39,8 +39,8 @@ def write_room(path, truth=True):
     ranges = ((np.sign(directions) * HALF - origins) / directions).min(axis=-1)
     arrays = {"poses": poses, "range": ranges, "directions": directions, "range_scale": 1.0}
     if truth:
-        frame, beam = rng.integers(0, FRAMES, RAYS), rng.integers(0, RAYS, RAYS)
-        ends = poses[frame, :3, 3] + ranges[frame, beam, None] * directions[beam]
+        frame, ray = rng.integers(0, FRAMES, RAYS), rng.integers(0, RAYS, RAYS)
+        ends = poses[frame, :3, 3] + ranges[frame, ray, None] * directions[ray]
         points = poses[frame, :3, 3] + rng.uniform(size=(RAYS, 1)) * (ends - poses[frame, :3, 3])
         gaps = HALF - np.abs(points)
         grad = -np.sign(points) * (gaps == gaps.min(axis=-1, keepdims=True))
@@ -180,7 +180,7 @@ def unmapped(tmp_path, monkeypatch):
         return sources.Source(name, None, None, None, complete=frames is None)
 
     monkeypatch.setattr(command, "open_source", opened)
-    monkeypatch.setattr(command, "measure", made_up)
+    monkeypatch.setattr(command, "measure_source", made_up)
     monkeypatch.setattr(command.figure, "save_figure", lambda *_: False)  # other tests draw
     monkeypatch.chdir(tmp_path)
     return ["--data", ".", "--streams", "house_depth", "--baseline", "baseline.json"]

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from plain_siren import mean_losses
 from room import BOUNDS, CONFIG, room_cloud
 
 import hiosdf_jax as hio
@@ -31,7 +32,7 @@ from benchmarks.speed import (
 from hiosdf_jax import datasets
 from hiosdf_jax._src.grid import nearest
 from hiosdf_jax._src.grid.windows import Window
-from hiosdf_jax._src.network import forward, loss, siren, training
+from hiosdf_jax._src.network import forward, siren, training
 from hiosdf_jax._src.numerics import loops
 from hiosdf_jax._src.samples.draw import Samples
 
@@ -92,7 +93,7 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
         return taken_apart[-1][-1]
 
     def chosen(setup):  # the others compile updates of their own, and have their own tests
-        tasks = plan.plan(setup).items()
+        tasks = plan.make_plan(setup).items()
         return {name: task for name, task in tasks if "sizes" not in name and name != "fleet"}
 
     def import_time(command, **_):
@@ -100,7 +101,7 @@ def test_every_row_has_numbers(stream, tmp_path, monkeypatch, capsys):
 
     extent = datasets.Extent(BOUNDS, CONFIG.max_range)
     monkeypatch.setattr(command, "QUICK", TINY)
-    monkeypatch.setattr(command, "plan", chosen)
+    monkeypatch.setattr(command, "make_plan", chosen)
     monkeypatch.setattr(setup.datasets, "find_bounds", lambda _: extent)
     monkeypatch.setattr(processes.subprocess, "check_output", import_time)
     monkeypatch.setattr(processes, "_HIOSDF", CHECKS_ITS_ARGUMENTS)
@@ -239,7 +240,7 @@ def test_a_task_makes_what_it_needs_and_shares_it(monkeypatch, tmp_path):
     monkeypatch.setattr(updates, "map_frames", map_frames)
     monkeypatch.setattr(limits, "measure", measure)
     monkeypatch.setattr(queries, "query_map", asked)
-    tasks = plan.plan(setup_of(tmp_path, []))
+    tasks = plan.make_plan(setup_of(tmp_path, []))
     assert made == []
     for _ in range(2):
         (row,), _ = tasks["queries"]()
@@ -253,7 +254,7 @@ def test_a_row_that_fails_says_why_and_the_rest_continues(stream, tmp_path, monk
         sound = rows.Measured([rows.Row("sound", "ms", rows.single(1.5))])
         return {"broken": lambda: [][0], "sound": lambda: sound}
 
-    monkeypatch.setattr(command, "plan", two_tasks)
+    monkeypatch.setattr(command, "make_plan", two_tasks)
     arguments = ["--stream", str(stream), "--output", str(tmp_path / "speed.json")]
     assert command.main(arguments) == 1
     table = capsys.readouterr().out
@@ -306,7 +307,7 @@ def test_work_is_what_xla_counts():
 
     def gradient(params):
         def total(params):
-            return sum(loss.losses(config, params, points, samples))
+            return sum(mean_losses(config, params, points, samples))
 
         return jax.grad(total)(params)
 
@@ -374,7 +375,7 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     points = jax.random.uniform(jax.random.key(1), (100, 3), minval=-1)
     weight = (jnp.arange(100) % 4 > 0).astype(jnp.float32)
     samples = Samples(points, jnp.linalg.norm(points, axis=-1) - 0.5, weight)
-    parts = loss.losses(config, network.params, points, samples)
+    parts = mean_losses(config, network.params, points, samples)
     weights = config.sdf_weight, config.eikonal_weight
     ours = weights[0] * parts.sdf + weights[1] * parts.eikonal
 
@@ -392,7 +393,7 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     trained, _, _ = training.train(
         config, network, samples, jnp.int32(0), jnp.float32(0), jax.random.key(2)
     )
-    after = loss.losses(config, trained.params, points, samples)
+    after = mean_losses(config, trained.params, points, samples)
     ours_after = weights[0] * after.sdf + weights[1] * after.eikonal
     theirs_after = torch_siren.loss(model, *tensors, weights).item()
     assert theirs_after < 0.9 * theirs.item()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from analytic import baked
 
-from hiosdf_jax._src.demo.geodesic import lay_plane
+from hiosdf_jax._src.demo.geodesic import lay_floor
 from hiosdf_jax._src.demo.robot import Robot, motion
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
@@ -43,12 +43,12 @@ def driver_with(unknown):
 def drive_at(field, unknown, steps=40, reward=1.0):
     """Drives along x for a reward; returns the states and whether the guard refused each step."""
     driver = driver_with(unknown)
-    plane = lay_plane(BOUNDS, 0.1)
+    floor = lay_floor(BOUNDS, 0.1)
     task = Task(
         field=field,
-        to_go=jnp.asarray(reward * (4 - plane.centers()[..., 0]), jnp.float32),
-        corner=jnp.asarray(plane.corner, jnp.float32),
-        spacing=jnp.float32(plane.spacing),
+        to_go=jnp.asarray(reward * (4 - floor.centers()[..., 0]), jnp.float32),
+        corner=jnp.asarray(floor.corner, jnp.float32),
+        spacing=jnp.float32(floor.spacing),
         heading=jnp.array([1.0, 0.0]),
     )
     plan, state = driver.plan, jnp.array([0.5, 1.5, 0.0, 0.0, 0.0])
@@ -84,9 +84,9 @@ def test_the_guard_lets_a_robot_leave_a_place_that_is_too_near():
 
 
 def test_the_path_is_straight_until_the_wall_is_seen_and_then_uses_the_door():
-    plane = lay_plane(BOUNDS, 0.1)
+    floor = lay_floor(BOUNDS, 0.1)
     start, goal = np.array([0.55, 0.55]), np.array([3.45, 0.55])
-    _, path_from, _ = make_task(ROBOT, field_of(wall_with_door), plane, goal)
+    _, path_from, _ = make_task(ROBOT, field_of(wall_with_door), floor, goal)
     path = path_from(start)
     crossing = path[np.argmin(np.abs(path[:, 0] - 2.0))]
     assert 2.0 + ROBOT.radius <= crossing[1] <= 2.8 - ROBOT.radius
@@ -95,12 +95,12 @@ def test_the_path_is_straight_until_the_wall_is_seen_and_then_uses_the_door():
         return 0.8 - np.hypot(points[..., 0] - 0.55, points[..., 1] - 0.55)
 
     blind = field_of(lambda p: np.full(p.shape[:-1], 2.0), near_start)
-    task, path_from, cells = make_task(ROBOT, blind, plane, goal)
+    task, path_from, cells = make_task(ROBOT, blind, floor, goal)
     assert np.abs(path_from(start)[:, 1] - 0.55).max() < 0.11
     assert cells.seen.mean() < 0.1
     np.testing.assert_allclose(head(task, path_from, start).heading, [1, 0], atol=0.02)
     # The path avoids barred cells although the map knows nothing of them.
-    barred = np.zeros(plane.shape, bool)
+    barred = np.zeros(floor.shape, bool)
     barred[19:21, :20] = True
-    _, path_from, _ = make_task(ROBOT, blind, plane, goal, barred)
+    _, path_from, _ = make_task(ROBOT, blind, floor, goal, barred)
     assert path_from(start)[:, 1].max() > 1.9

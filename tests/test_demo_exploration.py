@@ -12,7 +12,7 @@ from hiosdf_jax._src.command import cli
 
 pytest.importorskip("jax_mppi", reason="needs the extra 'plan'")
 from hiosdf_jax._src.demo import exploration
-from hiosdf_jax._src.demo.geodesic import Survey, lay_plane
+from hiosdf_jax._src.demo.geodesic import Survey, lay_floor
 from hiosdf_jax._src.demo.problem import draw_problem, exact_clearance
 from hiosdf_jax._src.demo.sensing import CAMERA_HEIGHT, camera_pose
 
@@ -33,13 +33,13 @@ def test_exact_clearance_is_that_of_the_capsule(model):
 
 
 def test_problems_are_solvable_and_not_trivial(model):
-    plane = lay_plane(exploration.BOUNDS_WORLD, 0.14)
-    gap = exact_clearance(model, ROBOT, plane.centers().reshape(-1, 2)).reshape(plane.shape)
+    floor = lay_floor(exploration.BOUNDS_WORLD, 0.14)
+    gap = exact_clearance(model, ROBOT, floor.centers().reshape(-1, 2)).reshape(floor.shape)
     regions, _ = label(gap > 0.08)
     kinds = set()
     for seed in range(4):
-        problem = draw_problem(model, ROBOT, plane, CAMERA_HEIGHT, seed)
-        start, goal = plane.cell(problem.start[:2]), plane.cell(problem.goal)
+        problem = draw_problem(model, ROBOT, floor, CAMERA_HEIGHT, seed)
+        start, goal = floor.cell(problem.start[:2]), floor.cell(problem.goal)
         assert regions[start] == regions[goal] != 0
         free = 0.14 * distance_transform_edt(gap > 0.08)
         assert free[start] > 0.15 and free[goal] > 0.15
@@ -50,7 +50,7 @@ def test_problems_are_solvable_and_not_trivial(model):
         assert demo.signed_distance(model, points)[0].min() < 0.05
         kinds.add(problem.rooms)
     assert len(kinds) >= 3
-    again = draw_problem(model, ROBOT, plane, CAMERA_HEIGHT, 3)
+    again = draw_problem(model, ROBOT, floor, CAMERA_HEIGHT, 3)
     np.testing.assert_array_equal(again.start, problem.start)
 
 
@@ -114,11 +114,11 @@ def test_a_stuck_robot_looks_around_and_gives_up_the_second_time():
 
 
 def test_only_unseen_cells_just_ahead_are_barred():
-    plane = lay_plane(((0, 0, 0), (3, 1, 1)), 0.1)
-    x = plane.centers()[..., 0]
-    cells = Survey(gap=np.ones(plane.shape), seen=x < 1.0)
+    floor = lay_floor(((0, 0, 0), (3, 1, 1)), 0.1)
+    x = floor.centers()[..., 0]
+    cells = Survey(gap=np.ones(floor.shape), seen=x < 1.0)
     path = np.column_stack([np.arange(0.55, 2.6, 0.07), np.full(30, 0.55)])
-    barred = exploration._bar(plane, path, cells)
+    barred = exploration._bar(floor, path, cells)
     # One cell around the unseen cells up to 1 m ahead.
     np.testing.assert_array_equal(barred[:, 5], (x[:, 0] > 0.9) & (x[:, 0] < 1.7))
     assert not barred[:, :4].any() and not barred[:, 7:].any()

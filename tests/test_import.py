@@ -45,7 +45,7 @@ def test_modules_are_attributes_and_the_version_is_known():
 import hiosdf_jax as hio, sys
 assert "hiosdf_jax.demo" not in sys.modules
 names = [hio.demo, hio.datasets, hio.scoring, hio.pictures]
-assert hio.planning.trajectory and hio.__version__
+assert hio.planning.mjx and hio.__version__
 assert {"demo", "datasets", "scoring", "pictures"} <= set(dir(hio))
 """
     subprocess.run([sys.executable, "-c", code], check=True)

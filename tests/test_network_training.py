@@ -7,10 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from plain_siren import BOUNDS, TINY, numpy_forward, numpy_gradient, some_samples
+from plain_siren import (
+    BOUNDS,
+    TINY,
+    mean_losses,
+    numpy_forward,
+    numpy_gradient,
+    some_samples,
+)
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.network import forward, loss, siren, tiles, training
+from hiosdf_jax._src.network import forward, siren, tiles, training
 
 
 def compiled_train():
@@ -32,7 +39,7 @@ train = compiled_train()
 def test_losses_are_equations_4_and_5(every):
     config = hio.Config.light(BOUNDS, hidden_width=8, hidden_layers=1, eikonal_every=every)
     params, samples = siren.init_params(config, jax.random.key(0)), some_samples()
-    losses = jax.jit(loss.losses, static_argnums=0)
+    losses = jax.jit(mean_losses, static_argnums=0)
     result = losses(config, params, samples.points_world, samples)
     used = np.asarray(samples.weight) > 0
     value = numpy_forward(config, params, samples.points_world)
@@ -50,7 +57,7 @@ def test_one_step_is_adamw_on_equation_3():
     points = samples.points_world - network.origin_world
 
     def objective(params):
-        parts = loss.losses(TINY, params, points, samples)
+        parts = mean_losses(TINY, params, points, samples)
         return TINY.sdf_weight * parts.sdf + TINY.eikonal_weight * parts.eikonal
 
     gradients = jax.jit(jax.grad(objective))(network.params)

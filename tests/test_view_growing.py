@@ -5,7 +5,7 @@ import trimesh
 from PIL import Image, ImageSequence
 
 from hiosdf_jax._src.view import shading
-from hiosdf_jax._src.view.growing import Stage, save_growing
+from hiosdf_jax._src.view.growing import GrowingMap, save_growing
 
 UP = np.array([0.0, 0, 1])
 
@@ -24,7 +24,7 @@ def frames_of(path):
 
 def test_what_is_known_grows_and_stays_in_place(tmp_path):
     path_world = np.array([[0.5, 2, 1], [2, 2, 1], [4, 3, 1]])
-    stages = [Stage(room(2.5), path_world[:2]), Stage(room(6), path_world)]
+    stages = [GrowingMap(room(2.5), path_world[:2]), GrowingMap(room(6), path_world)]
     save_growing(tmp_path / "growing.gif", stages, UP)
     half, whole = frames_of(tmp_path / "growing.gif")
     shown = [(frame.min(axis=-1) < 250) for frame in (half, whole)]
@@ -39,19 +39,19 @@ def test_what_is_known_grows_and_stays_in_place(tmp_path):
 
 
 def test_a_map_that_was_larger_before_is_cut_at_the_edge(tmp_path):
-    stages = [Stage(room(6), np.zeros((1, 3))), Stage(room(2), np.zeros((2, 3)))]
+    stages = [GrowingMap(room(6), np.zeros((1, 3))), GrowingMap(room(2), np.zeros((2, 3)))]
     save_growing(tmp_path / "growing.gif", stages, UP)
     large, small = frames_of(tmp_path / "growing.gif")
     assert large.shape == small.shape
 
 
 def test_a_map_without_surface_has_no_picture(tmp_path):
-    save_growing(tmp_path / "growing.gif", [Stage(trimesh.Trimesh(), np.zeros((1, 3)))], UP)
+    save_growing(tmp_path / "growing.gif", [GrowingMap(trimesh.Trimesh(), np.zeros((1, 3)))], UP)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_first_map_without_surface_is_white(tmp_path):
-    stages = [Stage(trimesh.Trimesh(), np.zeros((1, 3))), Stage(room(3), np.ones((2, 3)))]
+    stages = [GrowingMap(trimesh.Trimesh(), np.zeros((1, 3))), GrowingMap(room(3), np.ones((2, 3)))]
     save_growing(tmp_path / "growing.gif", stages, UP)
     first, _ = frames_of(tmp_path / "growing.gif")
     assert (first.min(axis=-1) > 250).mean() > 0.99

@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks import records
 from benchmarks.accuracy import figure, gate, results
-from benchmarks.accuracy.measure import measure
+from benchmarks.accuracy.measure import measure_source
 from benchmarks.accuracy.sources import open_source
 from hiosdf_jax import Config
 
@@ -119,7 +119,9 @@ def _measure(options: argparse.Namespace, table: Mapping[str, dict[str, Any]]) -
             label = ", ".join(filter(None, (config_name, *changed, row)))
             group = groups.setdefault((name, label), [])
             for seed in options.seeds:
-                group.append(measure(source, config_name, seed, options.every, overrides | changes))
+                group.append(
+                    measure_source(source, config_name, seed, options.every, overrides | changes)
+                )
                 # A long run that is cut off leaves its start.
                 records.write(options.output, [run for runs in groups.values() for run in runs])
     return groups, peers

@@ -28,7 +28,7 @@ EARLY_FRAMES = 20
 _HELD_OUT_SEED = 0
 
 
-def measure(
+def measure_source(
     source: Source, config_name: str, seed: int, every: int, overrides: dict[str, Any]
 ) -> dict[str, Any]:
     """Maps a stream and scores the map.

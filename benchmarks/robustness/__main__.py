@@ -32,7 +32,7 @@ def scenarios(data: Path) -> dict[str, Scenario]:
         "arm": movers.arm,
         "apartment": apartment.visit,
         "apartment_arm": apartment.arm,
-        "faults": partial(faults.faults, folder=data),
+        "faults": partial(faults.run_faults, folder=data),
     }
 
 

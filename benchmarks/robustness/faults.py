@@ -84,7 +84,7 @@ def open_stream(setup: Setup, folder: Path) -> Stream:
     return _house(setup, path) if path.is_file() else _room(setup)
 
 
-def faults(setup: Setup, folder: Path) -> Rows:
+def run_faults(setup: Setup, folder: Path) -> Rows:
     """Every fault, on the same clean stream."""
     stream = open_stream(setup, folder)
     half = _play(setup, stream, None, stream.frames[:_BURST_AFTER], "clean")

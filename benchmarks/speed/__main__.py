@@ -15,7 +15,7 @@ import jax
 from tqdm import tqdm
 
 from benchmarks import records
-from benchmarks.speed.plan import Task, plan
+from benchmarks.speed.plan import Task, make_plan
 from benchmarks.speed.rows import (
     OUT_OF_TIME,
     Baseline,
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.endurance is not None:
         sizes = dataclasses.replace(sizes, endurance=options.endurance)
     setup = open_setup(options.stream, sizes, began + 60 * options.minutes)
-    tasks = plan(setup)
+    tasks = make_plan(setup)
     if options.only:
         chosen = [name for name in tasks if any(part in name for part in options.only)]
         if not chosen:

@@ -14,7 +14,7 @@ from hiosdf_jax._src.state.pytrees import MapState
 Task = Callable[[], Measured]
 
 
-def plan(setup: Setup) -> dict[str, Task]:
+def make_plan(setup: Setup) -> dict[str, Task]:
     """Lists the tasks of a run.
 
     Args:

@@ -9,7 +9,7 @@ from benchmarks import records
 from benchmarks.tables.markdown import lay_out
 
 
-def provenance() -> str:
+def list_records() -> str:
     """Devices and versions of jax, by record."""
     cells = []
     for path in sorted(records.RESULTS.glob("*.json")):
@@ -20,7 +20,7 @@ def provenance() -> str:
     return lay_out(["record", "device", "jax"], cells)
 
 
-TABLES = {"records": provenance}
+TABLES = {"records": list_records}
 
 _KEYS = ("device", "jax")
 

@@ -86,7 +86,7 @@ def replacing_together(folder: _Path, names: Sequence[str]) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     _remove_abandoned(folder, _TOGETHER)
     with _naming(folder, folder):
-        aside, held = _make_folder_aside(folder)
+        aside, descriptor = _make_folder_aside(folder)
     try:
         with _naming_instead(aside, folder):
             yield aside
@@ -102,7 +102,7 @@ def replacing_together(folder: _Path, names: Sequence[str]) -> Iterator[Path]:
         _sync_folder(folder)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
-        os.close(held)
+        os.close(descriptor)
 
 
 def check_output(path: _Path) -> None:
@@ -141,8 +141,8 @@ def check_output_folder(folder: _Path, names: Sequence[str]) -> None:
         for name in names:
             _target(folder / name)
     with _naming(nearest, nearest):
-        aside, held = _make_folder_aside(nearest)
-    os.close(held)
+        aside, descriptor = _make_folder_aside(nearest)
+    os.close(descriptor)
     aside.rmdir()
 
 
@@ -191,24 +191,24 @@ def _open_aside(target: Path) -> tuple[Path, BinaryIO]:
 
 
 def _make_folder_aside(folder: Path) -> tuple[Path, int]:
-    """Makes a folder inside another one, and holds it by an open descriptor."""
+    """Makes a folder inside another one, and locks it by an open descriptor."""
     while True:
         aside = _name_aside(folder, _TOGETHER)
         aside.mkdir(mode=0o700)
-        held = None
+        descriptor = None
         try:
-            held = os.open(aside, os.O_RDONLY)
-            if _hold(held, aside):
-                return aside, held
-        except FileNotFoundError:  # taken for abandoned before it was held
+            descriptor = os.open(aside, os.O_RDONLY)
+            if _hold(descriptor, aside):
+                return aside, descriptor
+        except FileNotFoundError:  # taken for abandoned before it was locked
             pass
         except BaseException:
-            if held is not None:
-                os.close(held)
+            if descriptor is not None:
+                os.close(descriptor)
             aside.rmdir()
             raise
-        if held is not None:
-            os.close(held)
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def _name_aside(folder: Path, name: str) -> Path:
@@ -242,15 +242,15 @@ def _remove_abandoned(folder: Path, name: str) -> None:
 
 def _remove_if_free(aside: Path) -> None:
     with contextlib.suppress(OSError):
-        held = os.open(aside, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        descriptor = os.open(aside, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if stat.S_ISDIR(os.fstat(held).st_mode):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 shutil.rmtree(aside)
             else:
                 aside.unlink()
         finally:
-            os.close(held)
+            os.close(descriptor)
 
 
 def _copy_permissions(target: Path, new: int | Path) -> None:

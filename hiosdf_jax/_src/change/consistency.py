@@ -61,7 +61,7 @@ class Compared(NamedTuple):
     distance: jax.Array
 
 
-class Verdict(NamedTuple):
+class CloudVerdict(NamedTuple):
     """What a cloud is worth.
 
     Attributes:
@@ -76,7 +76,7 @@ class Verdict(NamedTuple):
 
 def judge(
     config: Config, grid: Grid, rays: Rays, updates: jax.Array, compared: Compared
-) -> Verdict:
+) -> CloudVerdict:
     """Judges a cloud by about a thousand of its rays.
 
     Args:
@@ -118,4 +118,4 @@ def judge(
         & (agreeing >= _LEAST_BESIDE * (comparable - in_free))
     )
     contradicts = suspicious & exceeds(_MOST_WRONG, _LEAST_WRONG) & ~fills_view
-    return Verdict(~(contradicts | noise), noise)
+    return CloudVerdict(~(contradicts | noise), noise)

@@ -103,7 +103,7 @@ def fuse_frames(
     frames = StreamFrames(stream, before, skip_bad_frames=skip_bad_frames, stop=stop)
     points_used, points_outside = before.points_used, before.points_outside
     seconds, path_world, ups_world = [], [], []
-    kept_world, kept_rng = [np.empty((0, 3), np.float32)], np.random.default_rng(0)
+    returns_world, rng = [np.empty((0, 3), np.float32)], np.random.default_rng(0)
     last_frame = 0
 
     def progress() -> Progress:
@@ -115,7 +115,7 @@ def fuse_frames(
             if i in held_out:
                 if tracker is not None:
                     pose = tracker.locate(state, cloud, pose, i)
-                kept_world.append(draw_returns(cloud, pose, config, len(held_out), kept_rng))
+                returns_world.append(draw_returns(cloud, pose, config, len(held_out), rng))
                 continue
             last_frame = i
             is_new = i >= before.next_frame
@@ -158,7 +158,7 @@ def fuse_frames(
         last_frame=last_frame,
         skipped=frames.skipped,
         stopped=frames.stopped,
-        held_out_world=np.concatenate(kept_world),
+        held_out_world=np.concatenate(returns_world),
         progress=progress(),
     )
 

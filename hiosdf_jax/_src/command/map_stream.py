@@ -25,10 +25,10 @@ from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.field.mesh import extract_mesh
 from hiosdf_jax._src.mapping import lifecycle
 from hiosdf_jax._src.output_files import replacing_together
-from hiosdf_jax._src.scoring import held_out
+from hiosdf_jax._src.scoring.held_out import held_out_frames, score_held_out
 from hiosdf_jax._src.state.pytrees import MapState, field_of
 from hiosdf_jax._src.view import drawing
-from hiosdf_jax._src.view.growing import Stage, save_growing
+from hiosdf_jax._src.view.growing import GrowingMap, save_growing
 
 if TYPE_CHECKING:
     import trimesh
@@ -111,7 +111,7 @@ def run_stream(
         with_progress=tracker is None,
     )
     growing = _Growing(len(stream), config.voxel_size) if draw_growing else None
-    kept = held_out.held_out_frames(len(stream)) if truth is None else range(0)
+    held_out = held_out_frames(len(stream)) if truth is None else range(0)
 
     def watch(state: MapState, progress: Progress, cloud: np.ndarray, pose: np.ndarray) -> None:
         if growing is not None:
@@ -125,7 +125,7 @@ def run_stream(
         stream,
         config,
         jax.random.key(seed),
-        held_out=kept,
+        held_out=held_out,
         skip_bad_frames=skip_bad_frames,
         resumed=resumed,
         keep=map_file.keep,
@@ -142,9 +142,9 @@ def run_stream(
     described = report.describe(mapped, config) | {"stream": name, "seed": seed}
     if truth is not None:
         described |= _score(queries, mapped, truth)
-    elif kept:
+    elif held_out:
         returns_world = mapped.held_out_world
-        score = held_out.score_held_out(queries.sdf, queries.observed, returns_world)
+        score = score_held_out(queries.sdf, queries.observed, returns_world)
         described["held_out"] = score
     return_freed_memory()
     also = "growing.gif, " if growing is not None else ""
@@ -187,7 +187,7 @@ class _Growing:
     def save(self, path: Path, path_world: np.ndarray, up_world: np.ndarray) -> None:
         if self._meshes:
             before = len(path_world) - self._fused  # positions of the run that this one continues
-            stages = [Stage(mesh, path_world[: before + k]) for k, mesh in self._meshes]
+            stages = [GrowingMap(mesh, path_world[: before + k]) for k, mesh in self._meshes]
             save_growing(path, stages, up_world)
 
 

@@ -16,8 +16,8 @@ import jax_mppi  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 from hiosdf_jax._src.demo.geodesic import (
+    Floor,
     PathFrom,
-    Plane,
     Survey,
     cell_costs,
     cost_to_go,
@@ -42,7 +42,7 @@ class Task(NamedTuple):
 
     Attributes:
         field: The map.
-        to_go: Cost to go at the centers of the plane's cells, m, (X, Y).
+        to_go: Cost to go at the centers of the floor's cells, m, (X, Y).
         corner: Center of cell (0, 0), (2,) m.
         spacing: Edge of a cell, () m.
         heading: Direction of travel, (2,) unit vector.
@@ -147,7 +147,7 @@ def make_driver(
 def make_task(
     robot: Robot,
     field: AnyField,
-    plane: Plane,
+    floor: Floor,
     goal: np.ndarray,
     barred: np.ndarray | None = None,
 ) -> tuple[Task, PathFrom, Survey]:
@@ -156,20 +156,20 @@ def make_task(
     Args:
         robot: The robot.
         field: The map.
-        plane: The cells of the geodesic.
+        floor: The cells of the geodesic.
         goal: (2,) m.
         barred: See `cell_costs`.
 
     Returns:
         The task, with no heading yet; the path from any point; what the map knows of the cells.
     """
-    cells = survey(robot, field, plane)
-    to_go, path_from = cost_to_go(cell_costs(robot, cells, barred), plane, goal)
+    cells = survey(robot, field, floor)
+    to_go, path_from = cost_to_go(cell_costs(robot, cells, barred), floor, goal)
     task = Task(
         field=field,
         to_go=jnp.asarray(to_go, jnp.float32),
-        corner=jnp.asarray(plane.corner, jnp.float32),
-        spacing=jnp.float32(plane.spacing),
+        corner=jnp.asarray(floor.corner, jnp.float32),
+        spacing=jnp.float32(floor.spacing),
         heading=jnp.zeros(2),
     )
     return task, path_from, cells

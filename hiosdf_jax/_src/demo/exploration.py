@@ -15,7 +15,7 @@ import numpy as np
 
 from hiosdf_jax._src.demo.apartment import BOUNDS_WORLD, load_model
 from hiosdf_jax._src.demo.driver import head, make_driver, make_task
-from hiosdf_jax._src.demo.geodesic import Plane, Survey, lay_plane
+from hiosdf_jax._src.demo.geodesic import Floor, Survey, lay_floor
 from hiosdf_jax._src.demo.problem import Problem, draw_problem, exact_clearance
 from hiosdf_jax._src.demo.robot import Robot, clearance, motion
 from hiosdf_jax._src.demo.sensing import (
@@ -32,7 +32,7 @@ from hiosdf_jax._src.state.pytrees import Field
 ROBOT = Robot(heights=(0.35, 0.49, 0.63, 0.77, 0.91, 1.05))
 _UNKNOWN = "obstacle"  # space that no ray has reached is solid
 _REACHED = 0.25  # m from the goal
-_CELL = 0.1  # m, of the geodesic's plane
+_CELL = 0.1  # m, of the geodesic's floor
 
 # When the robot looks around, the camera nods: otherwise it never sees what is overhead nearby.
 _PITCH_DRIVING, _PITCHES_LOOKING = np.radians(25), np.radians([25, -15])  # downward
@@ -42,12 +42,12 @@ _STUCK_AFTER, _STUCK_WITHIN = 5.0, 0.15  # s, m: stuck if it stays within this r
 _BAR_AHEAD = 1.0  # m of the path that is barred when looking around did not help
 
 
-class Moment(NamedTuple):
+class Decision(NamedTuple):
     """What the robot knew and planned after an update of its map.
 
     Attributes:
         step: Number of control steps before it.
-        cells: What the map knew of the plane.
+        cells: What the map knew of the floor.
         path: The planned path, (P, 2) m.
         rollouts: Positions in MPPI's rollouts, (K, T, 2) m.
         turning: Whether the robot turned on the spot to look around.
@@ -66,10 +66,10 @@ class Run(NamedTuple):
     Attributes:
         problem: Start and goal.
         states: (N + 1, 5) at the control steps, see `Robot`.
-        clearance: (N + 1,) m, in the map of that moment, unseen space as the policy takes it.
+        clearance: (N + 1,) m, in the map of that time, unseen space as the policy takes it.
         exact_clearance: (N + 1,) m, the least exact clearance over each step.
-        moments: One per update of the map.
-        plane: The cells of the moments.
+        decisions: One per update of the map.
+        floor: The cells of the decisions.
         field: The final map.
         metrics: Scalars.
     """
@@ -78,8 +78,8 @@ class Run(NamedTuple):
     states: np.ndarray
     clearance: np.ndarray
     exact_clearance: np.ndarray
-    moments: list[Moment]
-    plane: Plane
+    decisions: list[Decision]
+    floor: Floor
     field: Field
     metrics: dict[str, Any]
 
@@ -95,8 +95,8 @@ def explore(seed: int) -> Run:
     """
     begin = time.perf_counter()
     model = load_model()
-    plane = lay_plane(BOUNDS_WORLD, _CELL)
-    problem = draw_problem(model, ROBOT, plane, CAMERA_HEIGHT, seed)
+    floor = lay_floor(BOUNDS_WORLD, _CELL)
+    problem = draw_problem(model, ROBOT, floor, CAMERA_HEIGHT, seed)
     camera = robot_camera(model)
     key, plan_key = jax.random.split(jax.random.key(seed))
     driver = make_driver(ROBOT, _UNKNOWN, plan_key)
@@ -104,8 +104,8 @@ def explore(seed: int) -> Run:
 
     state, plan = jnp.array([*problem.start, 0.0, 0.0], jnp.float32), driver.plan
     watch = _Watch(problem.start[:2])
-    barred = np.zeros(plane.shape, bool)
-    states, passed, clearances, moments = [np.asarray(state)], [], [], []
+    barred = np.zeros(floor.shape, bool)
+    states, passed, clearances, decisions = [np.asarray(state)], [], [], []
     update_seconds, step_seconds, refusals = [], [], 0
     task = path_from = field = None
     reached, steps = False, int(_TIME_LIMIT / ROBOT.step)
@@ -113,14 +113,14 @@ def explore(seed: int) -> Run:
         xy = np.asarray(state[:2], float)
         if k % (_SENSE_EVERY_TURNING if watch.turning else _SENSE_EVERY) == 0:
             start = time.perf_counter()
-            pitch = _PITCHES_LOOKING[len(moments) % 2] if watch.turning else _PITCH_DRIVING
+            pitch = _PITCHES_LOOKING[len(decisions) % 2] if watch.turning else _PITCH_DRIVING
             pose = camera_pose(np.asarray(state), float(pitch))
             map_state = pipeline.update(map_state, camera.cloud(pose, (seed, k)), pose)
             field = lifecycle.snapshot(map_state, k * ROBOT.step)
-            task, path_from, cells = make_task(ROBOT, field, plane, problem.goal, barred)
+            task, path_from, cells = make_task(ROBOT, field, floor, problem.goal, barred)
             update_seconds.append(time.perf_counter() - start)
             rollouts = np.asarray(driver.rollouts(plan, state))[..., :2]
-            moments.append(Moment(k, cells, path_from(xy), rollouts, watch.turning))
+            decisions.append(Decision(k, cells, path_from(xy), rollouts, watch.turning))
         assert task is not None and path_from is not None and field is not None
         clearances.append(float(_clearance(ROBOT, field, state, _UNKNOWN)))
 
@@ -140,14 +140,14 @@ def explore(seed: int) -> Run:
         if reached:
             break
         if watch.looked_in_vain(moved[-1]):
-            barred |= _bar(plane, path_from(moved[-1, :2]), moments[-1].cells)
+            barred |= _bar(floor, path_from(moved[-1, :2]), decisions[-1].cells)
 
     assert field is not None
     clearances.append(float(_clearance(ROBOT, field, state, _UNKNOWN)))
     path = np.concatenate([problem.start[None, :2], *passed])
     exact = exact_clearance(model, ROBOT, path)
     exact = np.concatenate([exact[:1], exact[1:].reshape(len(passed), -1).min(axis=1)])
-    first_drive = next((moment for moment in moments if not moment.turning), moments[-1])
+    first_drive = next((decision for decision in decisions if not decision.turning), decisions[-1])
     metrics = {
         "seed": seed,
         "unknown": _UNKNOWN,
@@ -155,7 +155,7 @@ def explore(seed: int) -> Run:
         "to": problem.rooms[1],
         "start": problem.start.tolist(),
         "goal": problem.goal.tolist(),
-        "goal_seen_from_start": bool(first_drive.cells.seen[plane.cell(problem.goal)]),
+        "goal_seen_from_start": bool(first_drive.cells.seen[floor.cell(problem.goal)]),
         "reached": reached,
         "collided": bool(exact.min() < 0),
         "least_clearance_m": float(exact.min()),
@@ -171,7 +171,7 @@ def explore(seed: int) -> Run:
         "device": jax.devices()[0].device_kind,
     }
     return Run(
-        problem, np.array(states), np.array(clearances), exact, moments, plane, field, metrics
+        problem, np.array(states), np.array(clearances), exact, decisions, floor, field, metrics
     )
 
 
@@ -207,12 +207,12 @@ def _turn_on_the_spot(state: np.ndarray) -> jax.Array:
     return jnp.asarray([-state[3] / ROBOT.step, turn])
 
 
-def _bar(plane: Plane, path: np.ndarray, cells: Survey) -> np.ndarray:
+def _bar(floor: Floor, path: np.ndarray, cells: Survey) -> np.ndarray:
     """Marks the cells just ahead on a path that the robot may not enter, (X, Y) bool."""
-    barred = np.zeros(plane.shape, bool)
+    barred = np.zeros(floor.shape, bool)
     near = np.linalg.norm(path - path[0], axis=1) < _BAR_AHEAD
     for xy in path[near]:
-        i, j = plane.cell(xy)
+        i, j = floor.cell(xy)
         if not cells.seen[i, j]:
             barred[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = True
     return barred

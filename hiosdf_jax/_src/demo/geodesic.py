@@ -25,7 +25,7 @@ _AHEAD_M = 0.6  # distance of the place on the path toward which a robot heads
 _REACH_INTO_UNSEEN = 0.3  # m beyond observed space in which surfaces still count
 
 
-class Plane(NamedTuple):
+class Floor(NamedTuple):
     """Level cells that the geodesic runs over.
 
     Attributes:
@@ -50,7 +50,7 @@ class Plane(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """What a map knows of the cells of a plane.
+    """What a map knows of the cells of a floor.
 
     Attributes:
         gap: Clearance of the body to surfaces, m, (X, Y); inf where none is near observed space.
@@ -61,7 +61,7 @@ class Survey(NamedTuple):
     seen: np.ndarray
 
 
-def lay_plane(bounds: Any, spacing: float) -> Plane:
+def lay_floor(bounds: Any, spacing: float) -> Floor:
     """Covers the x and y of a box with cells.
 
     Args:
@@ -69,25 +69,25 @@ def lay_plane(bounds: Any, spacing: float) -> Plane:
         spacing: Edge of a cell, m.
 
     Returns:
-        The plane.
+        The floor.
     """
     low, high = np.asarray(bounds, float)[:, :2]
     x, y = np.ceil((high - low) / spacing - 1e-6).astype(int).tolist()
-    return Plane(low + spacing / 2, spacing, (x, y))
+    return Floor(low + spacing / 2, spacing, (x, y))
 
 
-def survey(robot: Robot, field: AnyField, plane: Plane) -> Survey:
+def survey(robot: Robot, field: AnyField, floor: Floor) -> Survey:
     """Queries the map for a robot's body in each cell.
 
     Args:
         robot: The robot.
         field: The map.
-        plane: The cells.
+        floor: The cells.
 
     Returns:
         What the map knows of each cell.
     """
-    points = body(robot, plane.centers().astype(np.float32))
+    points = body(robot, floor.centers().astype(np.float32))
     distance, frontier = (np.asarray(a) for a in _distance_and_frontier(field, points))
     # Behind observed space the sign is a guess, but the surface is real.
     unsigned = np.where(frontier > 0, distance, np.abs(distance))
@@ -120,12 +120,12 @@ def cell_costs(robot: Robot, cells: Survey, barred: np.ndarray | None = None) ->
     return np.where(blocked, _BLOCKED, costs)
 
 
-def cost_to_go(costs: np.ndarray, plane: Plane, goal: np.ndarray) -> tuple[np.ndarray, PathFrom]:
+def cost_to_go(costs: np.ndarray, floor: Floor, goal: np.ndarray) -> tuple[np.ndarray, PathFrom]:
     """Finds the cheapest paths from all cells to a goal.
 
     Args:
         costs: (X, Y), see `cell_costs`.
-        plane: The cells.
+        floor: The cells.
         goal: (2,) m.
 
     Returns:
@@ -134,12 +134,12 @@ def cost_to_go(costs: np.ndarray, plane: Plane, goal: np.ndarray) -> tuple[np.nd
     """
     from skimage.graph import MCP_Geometric
 
-    search = MCP_Geometric(costs * plane.spacing)
-    to_go, _ = search.find_costs([plane.cell(goal)])
+    search = MCP_Geometric(costs * floor.spacing)
+    to_go, _ = search.find_costs([floor.cell(goal)])
 
     def path_from(xy: np.ndarray) -> np.ndarray:
-        cells = np.array(search.traceback(plane.cell(xy)))[::-1]
-        return plane.corner + plane.spacing * cells
+        cells = np.array(search.traceback(floor.cell(xy)))[::-1]
+        return floor.corner + floor.spacing * cells
 
     return to_go, path_from
 

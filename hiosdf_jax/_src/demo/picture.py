@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hiosdf_jax._src.demo.apartment import BOUNDS_WORLD
-from hiosdf_jax._src.demo.exploration import ROBOT, Moment, Run
+from hiosdf_jax._src.demo.exploration import ROBOT, Decision, Run
 from hiosdf_jax._src.output_files import replacing
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def write_run(folder: Path, run: Run) -> None:
 
 
 def save_picture(path: str | os.PathLike[str], run: Run) -> None:
-    """Draws three moments of a run and its clearance over time.
+    """Draws three decisions of a run and its clearance over time.
 
     Args:
         path: The picture; its suffix names the format.
@@ -49,13 +49,13 @@ def save_picture(path: str | os.PathLike[str], run: Run) -> None:
 
     figure = Figure(figsize=(17, 8.6), layout="constrained")
     rows: Any = figure.subfigures(2, 1, height_ratios=(1.75, 1))
-    driving = [moment for moment in run.moments if not moment.turning] or run.moments
-    shown = [driving[0], driving[len(driving) // 2], run.moments[-1]]
+    driving = [decision for decision in run.decisions if not decision.turning] or run.decisions
+    shown = [driving[0], driving[len(driving) // 2], run.decisions[-1]]
     panels = rows[0].subplots(1, len(shown), sharey=True)
     titles = ("after looking around", "half-way", "in the end")
-    for ax, moment, title in zip(panels, shown, titles, strict=True):
-        image = _draw_moment(ax, run, moment)
-        ax.set_title(f"{title}: {moment.step * ROBOT.step:.0f} s", fontsize=12)
+    for ax, decision, title in zip(panels, shown, titles, strict=True):
+        image = _draw_decision(ax, run, decision)
+        ax.set_title(f"{title}: {decision.step * ROBOT.step:.0f} s", fontsize=12)
         ax.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
     rows[0].colorbar(
@@ -82,21 +82,21 @@ def save_animation(path: str | os.PathLike[str], run: Run) -> None:
     from matplotlib.figure import Figure
     from PIL import Image
 
-    every = -(-len(run.moments) // _GIF_FRAMES)
-    moments = run.moments[::every]
-    if moments[-1] is not run.moments[-1]:
-        moments.append(run.moments[-1])
+    every = -(-len(run.decisions) // _GIF_FRAMES)
+    decisions = run.decisions[::every]
+    if decisions[-1] is not run.decisions[-1]:
+        decisions.append(run.decisions[-1])
     figure = Figure(figsize=_GIF_INCHES, dpi=_GIF_DPI)
     canvas = FigureCanvasAgg(figure)
     frames = []
-    for moment in moments:
+    for decision in decisions:
         figure.clear()
         ax = figure.add_axes((0.05, 0.04, 0.93, 0.91))
-        _draw_moment(ax, run, moment)
+        _draw_decision(ax, run, decision)
         ax.set_title(
-            f"{moment.step * ROBOT.step:5.1f} s, clearance in the map "
-            f"{100 * run.clearance[moment.step]:3.0f} cm, exact "
-            f"{100 * run.exact_clearance[moment.step]:3.0f} cm",
+            f"{decision.step * ROBOT.step:5.1f} s, clearance in the map "
+            f"{100 * run.clearance[decision.step]:3.0f} cm, exact "
+            f"{100 * run.exact_clearance[decision.step]:3.0f} cm",
             fontsize=10,
         )
         canvas.draw()
@@ -109,31 +109,31 @@ def save_animation(path: str | os.PathLike[str], run: Run) -> None:
         frames[0].save(file, format="GIF", **animation)
 
 
-def _draw_moment(ax: Axes, run: Run, moment: Moment) -> Any:
+def _draw_decision(ax: Axes, run: Run, decision: Decision) -> Any:
     """Draws what the robot knew, seen from above; returns the image of distances."""
     from matplotlib.patches import Circle
 
     (x0, y0, _), (x1, y1, _) = BOUNDS_WORLD
     extent = (x0, x1, y0, y1)
-    gap = moment.cells.gap
+    gap = decision.cells.gap
     distance = np.where(np.isfinite(gap), gap + ROBOT.radius, np.nan).T
     ax.set_facecolor("0.75")
     image = ax.imshow(
         distance, extent=extent, origin="lower", cmap="RdBu", vmin=-_LIMIT, vmax=_LIMIT
     )
     # Cells seen at some heights only: the body may not enter them yet.
-    veil = np.where(moment.cells.seen.T | ~np.isfinite(distance), np.nan, 0.75)
+    veil = np.where(decision.cells.seen.T | ~np.isfinite(distance), np.nan, 0.75)
     ax.imshow(veil, extent=extent, origin="lower", cmap="gray", vmin=0, vmax=1, alpha=0.45)
-    x, y = (axis[:, 0] for axis in (run.plane.centers()[..., 0], run.plane.centers()[..., 1].T))
+    x, y = (axis[:, 0] for axis in (run.floor.centers()[..., 0], run.floor.centers()[..., 1].T))
     if np.nanmin(distance) < 0 < np.nanmax(distance):
         ax.contour(x, y, np.nan_to_num(distance, nan=1.0), levels=[0], colors="k", linewidths=1)
-    for rollout in moment.rollouts:
+    for rollout in decision.rollouts:
         ax.plot(*rollout.T, color="tab:orange", linewidth=0.5, alpha=0.7)
-    ax.plot(*moment.path.T, color="magenta", linewidth=1.2, linestyle=":")
-    ax.plot(*run.states[: moment.step + 1, :2].T, color="tab:green", linewidth=1.8)
+    ax.plot(*decision.path.T, color="magenta", linewidth=1.2, linestyle=":")
+    ax.plot(*run.states[: decision.step + 1, :2].T, color="tab:green", linewidth=1.8)
     ax.plot(*run.problem.start[:2], "o", color="tab:green", markersize=4)
     ax.plot(*run.problem.goal, "*", color="red", markersize=12, markeredgecolor="k")
-    px, py, yaw = run.states[moment.step, :3]
+    px, py, yaw = run.states[decision.step, :3]
     ax.add_patch(Circle((px, py), ROBOT.radius, facecolor="white", edgecolor="k", zorder=3))
     nose = ROBOT.radius * np.array([np.cos(yaw), np.sin(yaw)])
     ax.plot([px, px + nose[0]], [py, py + nose[1]], color="k", linewidth=2, zorder=4)
@@ -148,7 +148,7 @@ def _draw_clearance(ax: Axes, run: Run) -> None:
     ax.plot(seconds, 100 * run.clearance, color="tab:blue", linewidth=1, label=label)
     ax.axhline(100 * ROBOT.margin, color="tab:orange", linestyle="--", label="the guard's margin")
     ax.axhline(0, color="tab:red", label="collision")
-    stops = [moment.step for moment in run.moments if moment.turning]
+    stops = [decision.step for decision in run.decisions if decision.turning]
     for step in stops:
         ax.axvspan(*(ROBOT.step * np.array([step, step + 2])), color="0.9", linewidth=0, zorder=0)
     floor_cm = 100 * (ROBOT.heights[0] - ROBOT.radius)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.demo.geodesic import Plane
+from hiosdf_jax._src.demo.geodesic import Floor
 from hiosdf_jax._src.demo.primitives import signed_distance
 from hiosdf_jax._src.demo.robot import Robot
 
@@ -38,13 +38,13 @@ class Problem(NamedTuple):
     rooms: tuple[str, str]
 
 
-def draw_problem(model: Any, robot: Robot, plane: Plane, eye_height: float, seed: int) -> Problem:
+def draw_problem(model: Any, robot: Robot, floor: Floor, eye_height: float, seed: int) -> Problem:
     """Draws a start and a goal in another room, out of sight and with a path between them.
 
     Args:
         model: The apartment.
         robot: The robot.
-        plane: The cells to draw from.
+        floor: The cells to draw from.
         eye_height: Height of the line of sight, m.
         seed: Seed of the draw.
 
@@ -54,11 +54,11 @@ def draw_problem(model: Any, robot: Robot, plane: Plane, eye_height: float, seed
     from scipy.ndimage import distance_transform_edt, label
 
     rng = np.random.default_rng(seed)
-    centers = plane.centers()
+    centers = floor.centers()
     gap = exact_clearance(model, robot, centers.reshape(-1, 2), samples=len(robot.heights))
-    passable = gap.reshape(plane.shape) > _ROOM_TO_PASS
+    passable = gap.reshape(floor.shape) > _ROOM_TO_PASS
     regions: Any = label(passable)[0]  # pyright: ignore[reportIndexIssue]
-    roomy = plane.spacing * np.asarray(distance_transform_edt(passable)) > _ROOM_TO_START
+    roomy = floor.spacing * np.asarray(distance_transform_edt(passable)) > _ROOM_TO_START
     names = list(_ROOMS)
     while True:
         first, second = rng.choice(len(names), 2, replace=False).tolist()

@@ -43,8 +43,8 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
     """Finds the least distance over shifts: to the shifted voxel, or to what it is near."""
     reach = min(reach, inside.shape[axis] - 1)
     # The remaining distance across the axis, for a voxel inside and for one outside.
-    to_outside = pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE).held()
-    to_inside = pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE).held()
+    to_outside = pad_axis(jnp.where(inside, squared, 0), axis, reach, _INFINITE).computed_once()
+    to_inside = pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE).computed_once()
 
     def compare(k: jax.Array, best: jax.Array) -> jax.Array:
         for step in (-k, k):

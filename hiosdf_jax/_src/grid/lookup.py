@@ -126,7 +126,7 @@ def nearest_patch_at(
     return Nearest(jnp.where(any_found, sdf_m, config.distance_horizon), spread_m)
 
 
-class Plane(NamedTuple):
+class MeanPlane(NamedTuple):
     """The planes of the patches near points.
 
     Attributes:
@@ -146,7 +146,7 @@ class Plane(NamedTuple):
     away: jax.Array
 
 
-def nearest_plane_at(config: Config, surface: Surface, point: Vector) -> Plane:
+def nearest_plane_at(config: Config, surface: Surface, point: Vector) -> MeanPlane:
     """Finds the mean plane of the patches near points, to register clouds.
 
     The normal of a patch that was hit a few times is noise. The mean of eight is less so, and
@@ -181,7 +181,7 @@ def nearest_plane_at(config: Config, surface: Surface, point: Vector) -> Plane:
     height = dot(normal, offset)
     beside = length(each(lambda o, n: o - height * n, offset, normal))
     voxel = config.voxel_size
-    return Plane(
+    return MeanPlane(
         height=voxel * height,
         normal=normal,
         beside=voxel * beside,

@@ -201,8 +201,8 @@ def _find_nearest(
     # Otherwise XLA computes the candidates and their margins again for each shift, where it unrolls
     # the loop. On an H100 the sites of 1,024 small maps take 14 ms, and 22 ms without held margins.
     squared, along = jax.lax.optimization_barrier((squared, along))
-    far = pad_axis(squared, 1, reach, _INFINITE).part(first, length).held()
-    twice_along = pad_axis(2 * along, 1, reach).part(first, length).held()
+    far = pad_axis(squared, 1, reach, _INFINITE).part(first, length).computed_once()
+    twice_along = pad_axis(2 * along, 1, reach).part(first, length).computed_once()
 
     def candidate(shift: jax.Array) -> jax.Array:
         steps = shift.astype(jnp.float32)

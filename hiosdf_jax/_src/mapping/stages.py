@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient as held  # derivatives take it as it is
+from jax.lax import stop_gradient as constant  # derivatives take it as it is
 
 from hiosdf_jax._src.change import directions, hiding, novelty, robot, smoothing, stray, vanishing
 from hiosdf_jax._src.config import Config
@@ -129,7 +129,7 @@ def place_cloud(step: Step) -> Step:
 
 def drop_stray(step: Step) -> Step:
     """Leaves out isolated returns: they leave no surface and clear no space."""
-    kept = ~stray.find_stray(held(step.rays))
+    kept = ~stray.find_stray(constant(step.rays))
     placed = step.rays._replace(ends=step.rays.ends & kept, in_range=step.rays.in_range & kept)
     return step._replace(rays=placed)
 
@@ -144,7 +144,7 @@ def smooth_ranges(step: Step) -> Step:
 def compare_cloud(step: Step) -> Step:
     """Finds the returns on new things, and clouds that contradict the map as a whole."""
     found = novelty.compare_cloud(
-        step.config, held(step.state.grid), held(step.rays), step.state.updates
+        step.config, constant(step.state.grid), constant(step.rays), step.state.updates
     )
     contradicts = (step.flags == 0) & ~found.consistent
     return _flag(step._replace(novelty=found), Flag.INCONSISTENT_CLOUD, contradicts)
@@ -153,7 +153,7 @@ def compare_cloud(step: Step) -> Step:
 def calibrate_bound(step: Step) -> Step:
     """Compares the map so far with the cloud, for the lower bound of the distance."""
     optimism = calibration.calibrate_bound(
-        held(field_of(step.state)), held(step.rays), step.keys.bound
+        constant(field_of(step.state)), constant(step.rays), step.keys.bound
     )
     return step._replace(state=step.state.replace(optimism=optimism))
 
@@ -171,20 +171,22 @@ def fuse_hits(step: Step) -> Step:
 
 def trace_rays(step: Step) -> Step:
     """Counts the rays through free voxels and marks hidden ones (IV-B)."""
-    traced = carving.trace_rays(step.config, held(step.window), held(step.rays))
+    traced = carving.trace_rays(step.config, constant(step.window), constant(step.rays))
     return step._replace(window=_with_patches(traced, step.window))
 
 
 def renew_evidence(step: Step) -> Step:
     """Lets new evidence outweigh old: things that appear, space that they hide, what vanished."""
-    config, before, placed = step.config, held(step.before), held(step.rays)
-    window, fresh = hiding.add_new_surfaces(config, before, held(step.window), placed, step.novelty)
+    config, before, placed = step.config, constant(step.before), constant(step.rays)
+    window, fresh = hiding.add_new_surfaces(
+        config, before, constant(step.window), placed, step.novelty
+    )
     view = directions.view_of(placed)
     window = hiding.hide_behind(config, before, window, placed, view, fresh)
     window = vanishing.drop_vanished(config, before, window, placed, view, step.state.updates)
     if step.robot is not None:
         window = robot.clear_robot(config, window, *step.robot)
-    changed = vanishing.share_of_changes(before, held(step.window), window)
+    changed = vanishing.share_of_changes(before, constant(step.window), window)
     return step._replace(window=_with_patches(window, step.window), changed=changed)
 
 
@@ -203,14 +205,14 @@ def write_window(step: Step) -> Step:
 
 def update_distances(step: Step) -> Step:
     """Finds the nearest patch and the sign of every voxel (IV-B)."""
-    grid, box = held(step.state.grid), windows.box_of_rays(held(step.rays))
+    grid, box = constant(step.state.grid), windows.box_of_rays(constant(step.rays))
     derived = distance.update_distances(step.config, grid, box).derived
     return _with_grid(step, step.state.grid.replace(derived=derived))
 
 
 def update_frontier(step: Step) -> Step:
     """Computes every voxel's distance to unseen space."""
-    grid, box = held(step.state.grid), windows.box_of_rays(held(step.rays))
+    grid, box = constant(step.state.grid), windows.box_of_rays(constant(step.rays))
     derived = frontier.update_frontier(step.config, grid, box).derived
     return _with_grid(step, step.state.grid.replace(derived=derived))
 
@@ -218,13 +220,13 @@ def update_frontier(step: Step) -> Step:
 def sample_grid(step: Step) -> Step:
     """Draws training samples from the grid (IV-B)."""
     return step._replace(
-        samples=from_grid.sample_grid(step.config, held(step.state.grid), step.keys.grid)
+        samples=from_grid.sample_grid(step.config, constant(step.state.grid), step.keys.grid)
     )
 
 
 def sample_cloud(step: Step) -> Step:
     """Adds training samples from the newest cloud: the local SDF (IV-C)."""
-    local = from_cloud.sample_cloud(step.config, held(step.rays), step.keys.cloud)
+    local = from_cloud.sample_cloud(step.config, constant(step.rays), step.keys.cloud)
     return step._replace(samples=concatenate(step.samples, local))
 
 
@@ -232,7 +234,12 @@ def train(step: Step) -> Step:
     """Fits the network to the samples (IV-D)."""
     extra_epochs, average = training.schedule(step.config, step.state.updates, step.changed)
     network, losses, trained = training.train(
-        step.config, held(step.state.network), step.samples, extra_epochs, average, step.keys.order
+        step.config,
+        constant(step.state.network),
+        step.samples,
+        extra_epochs,
+        average,
+        step.keys.order,
     )
     state = step.state.replace(network=network)
     return step._replace(state=state, losses=losses, trained=trained)

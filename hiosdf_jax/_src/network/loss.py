@@ -27,8 +27,8 @@ class Losses(NamedTuple):
     eikonal: jax.Array
 
 
-def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """Computes the losses over samples; the Eikonal loss takes the first group of them.
+def sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
+    """Sums the losses over samples; the Eikonal loss takes the first group of them.
 
     Args:
         config: The map's configuration.
@@ -37,13 +37,8 @@ def losses(config: Config, params: Any, points: jax.Array, samples: Samples) -> 
         samples: The samples.
 
     Returns:
-        Their means over the samples with weight.
+        The losses times the sums of `weights`.
     """
-    return means(sums(config, params, points, samples), weights(config, samples))
-
-
-def sums(config: Config, params: Any, points: jax.Array, samples: Samples) -> Losses:
-    """Computes the losses times the sums of `weights`; see `losses`."""
     sloped = sloped_rows(config, samples)
     value, gradient = forward.value_and_gradient(config.frequency, params, points[:sloped])
     if sloped < points.shape[0]:

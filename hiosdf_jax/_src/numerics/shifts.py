@@ -36,7 +36,7 @@ class Padded(NamedTuple):
         values = jax.lax.dynamic_slice_in_dim(self.values, first, size + 2 * self.reach, self.axis)
         return self._replace(values=values)
 
-    def held(self) -> Padded:
+    def computed_once(self) -> Padded:
         """Has the array computed once on a GPU, where a step of a loop reads many shifts of it.
 
         A CPU takes one shift per step; there the frontier would take 1.2 times as long.

@@ -21,7 +21,7 @@ _PATH_COLOR = (204, 60, 160)
 _DOT_PIXELS = 4  # radius of the dot where the sensor is
 
 
-class Stage(NamedTuple):
+class GrowingMap(NamedTuple):
     """A map on its way.
 
     Attributes:
@@ -34,7 +34,7 @@ class Stage(NamedTuple):
 
 
 def save_growing(
-    path: str | os.PathLike[str], stages: Sequence[Stage], up_world: np.ndarray
+    path: str | os.PathLike[str], stages: Sequence[GrowingMap], up_world: np.ndarray
 ) -> None:
     """Draws how a map grows, with the path of the sensor, as an animated GIF.
 

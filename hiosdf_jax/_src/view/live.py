@@ -17,7 +17,7 @@ from hiosdf_jax._src.numerics.intake import as_real
 from hiosdf_jax._src.planning.clearance import checked_spheres
 from hiosdf_jax._src.state.checks import as_live_field
 from hiosdf_jax._src.state.pytrees import Field, MapState
-from hiosdf_jax._src.view import colors, moments, page, scene, serving, stage
+from hiosdf_jax._src.view import colors, moments, page, scene, stage, web_server
 
 _UP = (0.0, 0.0, 1.0)
 _AXES = ("x", "y", "z")
@@ -29,8 +29,8 @@ def view(
     spheres: tuple[Any, Any] | None = None,
     exact_sdf: Callable[[np.ndarray], np.ndarray] | None = None,
     up_world: Any = _UP,
-    host: str = serving.LOOPBACK,
-    port: int = serving.PORT,
+    host: str = web_server.LOOPBACK,
+    port: int = web_server.PORT,
 ) -> Viewer:
     """Shows a map in a browser, in three dimensions.
 
@@ -89,8 +89,8 @@ class Viewer:
         *,
         exact_sdf: Callable[[np.ndarray], np.ndarray] | None = None,
         up_world: Any = _UP,
-        host: str = serving.LOOPBACK,
-        port: int = serving.PORT,
+        host: str = web_server.LOOPBACK,
+        port: int = web_server.PORT,
         on_save: Callable[[], str] | None = None,
         export_path: str | os.PathLike[str] = "scene.html",
         can_pause: bool = False,
@@ -118,8 +118,8 @@ class Viewer:
         self._look = stage.Look(axis=int(np.argmax(np.abs(up))))
         self._on_save, self._export_path = on_save, export_path
         self.paused = False
-        self._server = serving.serve(host, port)
-        shown_host = serving.LOOPBACK if host in ("", "0.0.0.0") else host
+        self._server = web_server.serve(host, port)
+        shown_host = web_server.LOOPBACK if host in ("", "0.0.0.0") else host
         self.url = f"http://{shown_host}:{self._server.get_port()}"
         self._scales: list[colors.Scale] = []
         self._legend: Any = None
@@ -214,7 +214,7 @@ class Viewer:
 
     def close(self) -> None:
         """Ends the view."""
-        serving.stop(self._server)
+        web_server.stop(self._server)
 
     def _repr_html_(self) -> str:
         """The view itself, in a notebook on this machine."""

@@ -7,7 +7,7 @@ import io
 import os
 
 from hiosdf_jax._src.output_files import replacing
-from hiosdf_jax._src.view import colors, serving, stage
+from hiosdf_jax._src.view import colors, stage, web_server
 from hiosdf_jax._src.view.moments import Moment
 
 _MOST_FRAMES = 12  # a snapshot of a house takes about 2 MB
@@ -40,7 +40,7 @@ def write_page(
     given = given or stage.Given()
     step = -(-len(moments) // _MOST_FRAMES)
     played = moments[::-1][::step][::-1]
-    server = serving.serve(port=0)
+    server = web_server.serve(port=0)
     try:
         stage.prepare(server, played[-1], given)
         stage.draw(server, played[0], look, given, spheres)
@@ -54,7 +54,7 @@ def write_page(
             recording.insert_sleep(_SECONDS_AT_END)
         document = recording.as_html()
     finally:
-        serving.stop(server)
+        web_server.stop(server)
     picture = _as_png(colors.draw_bars(scales, stage.notes(look)))
     legend = (
         '<img alt="legend" style="position:fixed;right:12px;top:12px;width:300px;z-index:9;'

@@ -29,7 +29,7 @@ _SURFACE = (0, 0, 0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Plane:
+class SlicePlane:
     """A slice of a map as a picture that stands in the world.
 
     Attributes:
@@ -145,7 +145,7 @@ def without_specks(mesh: trimesh.Trimesh, up_world: np.ndarray = _UP) -> np.ndar
     return faces[shown]
 
 
-def cut(queries: CompiledQueries, axis: int, at_m: float) -> Plane:
+def cut(queries: CompiledQueries, axis: int, at_m: float) -> SlicePlane:
     """Cuts a map along a plane across an axis of the world.
 
     The picture has about 16,000 pixels, one evaluation of the map.
@@ -186,7 +186,7 @@ def cut(queries: CompiledQueries, axis: int, at_m: float) -> Plane:
     center[axis] = at_m
     right, down = np.zeros(3), np.zeros(3)
     right[across], down[along] = 1.0, -1.0
-    return Plane(image, center, float(span[across]), float(span[along]), right, down)
+    return SlicePlane(image, center, float(span[across]), float(span[along]), right, down)
 
 
 def edge_of_unseen(field: Field) -> tuple[np.ndarray, np.ndarray]:

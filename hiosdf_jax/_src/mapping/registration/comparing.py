@@ -40,7 +40,7 @@ INLIER_DEVIATIONS = 3.0
 _OUTLIER_DEVIATIONS = INLIER_DEVIATIONS, 1.5
 
 # No patch is known better than this, m, and no return across its ray better than this, rad: pixels
-# and beams are that wide. Without it distant surfaces at grazing angles count too much.
+# and laser beams are that wide. Without it distant surfaces at grazing angles count too much.
 _LEAST_SIGMA_M = 0.006
 _ACROSS_RAD = 0.002
 

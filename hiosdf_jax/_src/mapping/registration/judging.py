@@ -38,11 +38,11 @@ _ALLOWANCE = 0.02
 # well the returns that fit hold the pose along a ray is 1 / d^T N^-1 d, where N is the mean outer
 # product of their normals: 1 if all normals are along the ray, and a third if they point
 # everywhere. Along a tube it is 0, or 0.03 by chance. A blocked ray counts as the first weight at
-# 0, and as the second one from _HELD on. A map that refuses a right pose never sees that something
-# is gone.
+# 0, and as the second one from _FULL_SUPPORT on. A map that refuses a right pose never sees that
+# something is gone.
 _GONE_WEIGHTS = 10.0, 0.5
-_HELD = 0.05
-_LEAST_HELD = 1e-3
+_FULL_SUPPORT = 0.05
+_LEAST_SUPPORT = 1e-3
 
 # A right pose rarely has both blocked rays and returns that do not fit, so the geometric mean of
 # the two counts most. One ray may be both: through a solid, and to a return in free space.
@@ -51,7 +51,7 @@ _BOTH_WEIGHT = 3.0
 _RAYS = 256
 
 
-class Verdict(NamedTuple):
+class PoseVerdict(NamedTuple):
     """How well a cloud fits a map at a pose.
 
     Attributes:
@@ -65,7 +65,7 @@ class Verdict(NamedTuple):
     fits: jax.Array
 
 
-def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
+def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> PoseVerdict:
     """Judges a pose.
 
     Args:
@@ -102,7 +102,7 @@ def judge(field: Field | Baked, rows: Rows, pose: jax.Array) -> Verdict:
     fits = comparable >= jnp.maximum(LEAST_COMPARABLE * total, 1)
     fits &= share >= LEAST_INLIERS
     fits &= supporting >= _LEAST_SHARE * (supporting + contrary)
-    return Verdict(jnp.sqrt(square), share, fits)
+    return PoseVerdict(jnp.sqrt(square), share, fits)
 
 
 def _weigh_blocked(mean_product: jax.Array, offset: jax.Array) -> jax.Array:
@@ -116,6 +116,6 @@ def _weigh_blocked(mean_product: jax.Array, offset: jax.Array) -> jax.Array:
         (N,).
     """
     direction = join(unit(split(offset)))
-    product = mean_product + _LEAST_HELD * jnp.eye(3)
-    held = 1 / jnp.sum(direction * solve_positive(product, direction), axis=-1)
-    return jnp.asarray(between(_GONE_WEIGHTS, jnp.minimum(held / _HELD, 1)))
+    product = mean_product + _LEAST_SUPPORT * jnp.eye(3)
+    support = 1 / jnp.sum(direction * solve_positive(product, direction), axis=-1)
+    return jnp.asarray(between(_GONE_WEIGHTS, jnp.minimum(support / _FULL_SUPPORT, 1)))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-Bounds = tuple[np.ndarray, np.ndarray]
+DistanceBounds = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds of the signed distance, (N,) m each."""
 
 
@@ -27,9 +27,9 @@ class Solid(NamedTuple):
         rough: The same without a search; looser everywhere.
     """
 
-    distance: Callable[[np.ndarray], Bounds]
-    quick: Callable[[np.ndarray], Bounds]
-    rough: Callable[[np.ndarray], Bounds]
+    distance: Callable[[np.ndarray], DistanceBounds]
+    quick: Callable[[np.ndarray], DistanceBounds]
+    rough: Callable[[np.ndarray], DistanceBounds]
 
 
 SphereCover = tuple[np.ndarray, np.ndarray]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hiosdf_jax._src.planning.robot.cover import Bounds, Solid, lengths
+from hiosdf_jax._src.planning.robot.cover import DistanceBounds, Solid, lengths
 
 # Relative error that the search for the nearest point of a mesh may make.
 _SEARCH = 0.01
@@ -30,7 +30,7 @@ def cylinder(radius: float, half_length: float) -> Solid:
         The distance; both bounds are exact.
     """
 
-    def distance(points: np.ndarray) -> Bounds:
+    def distance(points: np.ndarray) -> DistanceBounds:
         value = distance_beyond(cylinder_profile(points, radius, half_length))
         return value, value
 
@@ -76,7 +76,7 @@ def ellipsoid(semi_axes: np.ndarray) -> Solid:
     squares = semi_axes**2
     least = squares.min()
 
-    def distance(points: np.ndarray) -> Bounds:
+    def distance(points: np.ndarray) -> DistanceBounds:
         # The nearest point is r_k^2 p_k / (t + r_k^2) for the t > -min r^2 that puts it on the
         # surface. Off the planes of symmetry exactly one such t exists.
         p = np.maximum(np.abs(points), 1e-9 * semi_axes.max())
@@ -136,7 +136,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
     half_diagonal = np.sqrt(3) * pitch / 2
     slack = half_diagonal + np.sqrt(3) * error
 
-    def signed(points: np.ndarray, near: np.ndarray, far: np.ndarray) -> Bounds:
+    def signed(points: np.ndarray, near: np.ndarray, far: np.ndarray) -> DistanceBounds:
         """Bounds of the signed distance by those of the distance."""
         place = (points - corner) / pitch
         cell = np.floor(place).astype(int)
@@ -155,12 +155,12 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
             rows = rows[sign[rows] == 0]
         return np.where(sign > 0, near, -far), np.where(sign < 0, -near, far)
 
-    def tight(points: np.ndarray) -> Bounds:
+    def tight(points: np.ndarray) -> DistanceBounds:
         # Approximate: exact searches from deep inside are slow.
         far = np.asarray(tree.query(points, eps=_SEARCH)[0])
         return signed(points, np.maximum(far / (1 + _SEARCH) - error, 0), far)
 
-    def bound(points: np.ndarray) -> Bounds:
+    def bound(points: np.ndarray) -> DistanceBounds:
         """Bounds of the distance by the lattice and the box around the mesh."""
         cell = np.clip(((points - corner) / pitch).astype(int), 0, counts - 1)
         offset = lengths(points - (corner + pitch * (cell + 0.5)))
@@ -169,7 +169,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
         near = np.maximum(np.maximum(center - offset - half_diagonal, box - error), 0)
         return near, center + offset + slack
 
-    def quick(points: np.ndarray) -> Bounds:
+    def quick(points: np.ndarray) -> DistanceBounds:
         near, far = bound(points)
         # Cheap where the surface is close, which is where it matters.
         close = np.nonzero(near < pitch)[0]
@@ -180,7 +180,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> Solid:
             near[close] = np.maximum(near[close], far[close] - error)
         return signed(points, near, far)
 
-    def rough(points: np.ndarray) -> Bounds:
+    def rough(points: np.ndarray) -> DistanceBounds:
         return signed(points, *bound(points))
 
     return Solid(tight, quick, rough)
