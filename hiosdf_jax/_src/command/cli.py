@@ -25,9 +25,9 @@ from hiosdf_jax._src.command.inputs import (
     open_inputs,
     option_name,
     resumed_map,
-    sample_truth,
     seed_of,
     stamps_of,
+    truth_of_scene,
 )
 from hiosdf_jax._src.command.outputs import check_folder, check_outputs, is_map
 from hiosdf_jax._src.command.run import run_mapping
@@ -204,7 +204,7 @@ def _map(options: argparse.Namespace) -> None:
         config = configure(options.config, bounds, **overrides)
     exact_sdf = None
     if options.ground_truth is not None:
-        truth, exact_sdf = sample_truth(options.ground_truth, stream, config.max_range)
+        truth, exact_sdf = truth_of_scene(options.ground_truth, stream, config.max_range)
     run_mapping(
         options,
         stream,
@@ -298,7 +298,7 @@ def _eval(options: argparse.Namespace) -> None:
     state = checked(lambda: load(options.map))
     stream, truth = open_inputs(options)
     if options.ground_truth is not None:
-        truth, _ = sample_truth(options.ground_truth, stream, state.config.max_range)
+        truth, _ = truth_of_scene(options.ground_truth, stream, state.config.max_range)
     if truth is None:
         reason = "has no exact distances, expected --ground-truth"
         raise Failure(f"{options.stream} {reason}", BAD_INPUT)

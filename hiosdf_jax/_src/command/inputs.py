@@ -148,7 +148,7 @@ def _first_frame(stream: Stream) -> tuple[np.ndarray, np.ndarray]:
     raise ValueError(f"none of the {len(stream)} frames can be used, expected at least one")
 
 
-def sample_truth(
+def truth_of_scene(
     file: Path, stream: Stream, max_range: float
 ) -> tuple[GroundTruth, Callable[[np.ndarray], np.ndarray]]:
     """Exact distances of a scene where the stream observed it, and the distances to draw."""
