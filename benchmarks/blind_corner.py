@@ -127,7 +127,7 @@ def run(scene: Scene, seed: int, unknown: str, driver: Driver) -> dict[str, obje
     """Drives to the goal once."""
     rng = np.random.default_rng((seed, 1))
     directions = lidar_directions()
-    plane = lay_floor(BOUNDS, 0.1)
+    floor = lay_floor(BOUNDS, 0.1)
     map_state = hio.init(map_config(), jax.random.key(seed))
     state = jnp.array([*scene.start, 0.0, 0.0, 0.0])
     plan, states = driver.plan, [np.asarray(state)[None]]
@@ -147,7 +147,7 @@ def run(scene: Scene, seed: int, unknown: str, driver: Driver) -> dict[str, obje
             ranges += NOISE * rng.normal(size=len(ranges))
             cloud = np.where(ranges < MAX_RANGE, ranges, np.nan)[:, None] * directions
             map_state = hio.update(map_state, cloud, pose)
-            task, path_from, _ = make_task(ROBOT, hio.snapshot(map_state), plane, scene.goal)
+            task, path_from, _ = make_task(ROBOT, hio.snapshot(map_state), floor, scene.goal)
         task = head(task, path_from, np.array([x, y]))
         control, plan, _ = driver.step(plan, state, task)
         passed = motion(ROBOT, state, control)

@@ -99,7 +99,7 @@ def test_a_stopped_run_continues(tmp_path, capsys, monkeypatch, quick, recording
 def test_a_run_that_is_stopped_twice_without_a_file_of_its_own(
     tmp_path, capsys, monkeypatch, recording
 ):
-    """With all pictures; the map waits in the folder until the run has come to its end."""
+    """With all pictures; the map waits in the folder until the run has finished."""
     use_room_config(monkeypatch)
     output = tmp_path / "out"
     first = ["map", "--output", str(output), *BOX, "--frames", "12", "--", str(recording[0])]

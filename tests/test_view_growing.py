@@ -5,7 +5,7 @@ import trimesh
 from PIL import Image, ImageSequence
 
 from hiosdf_jax._src.view import shading
-from hiosdf_jax._src.view.growing import GrowingMap, save_growing
+from hiosdf_jax._src.view.growing import MapSoFar, save_growing
 
 UP = np.array([0.0, 0, 1])
 
@@ -24,13 +24,13 @@ def frames_of(path):
 
 def test_what_is_known_grows_and_stays_in_place(tmp_path):
     path_world = np.array([[0.5, 2, 1], [2, 2, 1], [4, 3, 1]])
-    stages = [GrowingMap(room(2.5), path_world[:2]), GrowingMap(room(6), path_world)]
-    save_growing(tmp_path / "growing.gif", stages, UP)
+    maps = [MapSoFar(room(2.5), path_world[:2]), MapSoFar(room(6), path_world)]
+    save_growing(tmp_path / "growing.gif", maps, UP)
     half, whole = frames_of(tmp_path / "growing.gif")
     shown = [(frame.min(axis=-1) < 250) for frame in (half, whole)]
     assert 0.2 < shown[0].sum() / shown[1].sum() < 0.7
     assert not (shown[0] & ~shown[1]).any()
-    view = shading.viewpoint(stages[-1].mesh, (640, 480), UP)
+    view = shading.viewpoint(maps[-1].mesh, (640, 480), UP)
     for frame, known in ((half, 2), (whole, 3)):
         column, row = np.rint(view.pixels(path_world[known - 1])).astype(int)
         assert (frame[row, column] == (204, 60, 160)).all()  # the dot of the sensor
@@ -39,19 +39,19 @@ def test_what_is_known_grows_and_stays_in_place(tmp_path):
 
 
 def test_a_map_that_was_larger_before_is_cut_at_the_edge(tmp_path):
-    stages = [GrowingMap(room(6), np.zeros((1, 3))), GrowingMap(room(2), np.zeros((2, 3)))]
-    save_growing(tmp_path / "growing.gif", stages, UP)
+    maps = [MapSoFar(room(6), np.zeros((1, 3))), MapSoFar(room(2), np.zeros((2, 3)))]
+    save_growing(tmp_path / "growing.gif", maps, UP)
     large, small = frames_of(tmp_path / "growing.gif")
     assert large.shape == small.shape
 
 
 def test_a_map_without_surface_has_no_picture(tmp_path):
-    save_growing(tmp_path / "growing.gif", [GrowingMap(trimesh.Trimesh(), np.zeros((1, 3)))], UP)
+    save_growing(tmp_path / "growing.gif", [MapSoFar(trimesh.Trimesh(), np.zeros((1, 3)))], UP)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_first_map_without_surface_is_white(tmp_path):
-    stages = [GrowingMap(trimesh.Trimesh(), np.zeros((1, 3))), GrowingMap(room(3), np.ones((2, 3)))]
-    save_growing(tmp_path / "growing.gif", stages, UP)
+    maps = [MapSoFar(trimesh.Trimesh(), np.zeros((1, 3))), MapSoFar(room(3), np.ones((2, 3)))]
+    save_growing(tmp_path / "growing.gif", maps, UP)
     first, _ = frames_of(tmp_path / "growing.gif")
     assert (first.min(axis=-1) > 250).mean() > 0.99

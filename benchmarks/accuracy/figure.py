@@ -28,7 +28,7 @@ def save_figure(
 
     Args:
         path: The picture.
-        groups: {(stream, configuration): runs from `measure`}.
+        groups: {(stream, configuration): runs from `measure_source`}.
         peers: {stream: {peer: figures}}.
 
     Returns:

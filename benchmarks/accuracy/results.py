@@ -29,7 +29,7 @@ def figures_of(runs: Sequence[dict[str, Any]]) -> dict[str, Figures]:
     """Gathers the figures of runs that differ in their seeds alone.
 
     Args:
-        runs: From `measure`.
+        runs: From `measure_source`.
 
     Returns:
         {variant: figures}, for all figures that were measured.
@@ -62,7 +62,7 @@ def describe(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Returns what identifies runs that differ in their seeds alone.
 
     Args:
-        runs: From `measure`.
+        runs: From `measure_source`.
 
     Returns:
         Their number of frames, device, version of jax, revision and seeds.
@@ -76,7 +76,7 @@ def update_tables(path: Path, groups: Mapping[tuple[str, str], Sequence[dict[str
 
     Args:
         path: The record; made if it is not there.
-        groups: {(stream, label of the configuration): runs from `measure`}.
+        groups: {(stream, label of the configuration): runs from `measure_source`}.
     """
     record = records.read(path)
     for (stream, label), runs in groups.items():

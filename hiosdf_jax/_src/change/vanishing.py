@@ -117,7 +117,7 @@ def drop_vanished(
     change = put(change, jnp.where(vanished, _GONE, counted))
 
     def spread(vanished: jax.Array) -> jax.Array:
-        """Adds the remains of objects: edges that few rays meet vanish with them."""
+        """Adds the remains of objects: edges that few rays meet vanish with their objects."""
         around, inside = _around(change.shape, row)
         mapped = inside & (window.hits.ravel()[around] > 0)
 

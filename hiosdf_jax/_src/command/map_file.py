@@ -58,7 +58,7 @@ class MapFile:
         """
         self.error: OSError | None = None
         self._path = path_of_map(output, save_path)
-        self._unfinished = output / UNFINISHED
+        self._unfinished = output / UNFINISHED  # the same file, if there is no `save_path`
         self._is_result = save_path is not None
         self._own = set() if resume_path is None else {Path(resume_path).resolve()}
         self._frames, self._seed, self._held_out = frames, seed, held_out

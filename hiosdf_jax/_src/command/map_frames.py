@@ -143,7 +143,7 @@ def fuse_frames(
                 loss_cm = 100 * float(state.report.sdf_loss)
                 text = f"loss {loss_cm:.1f} cm, {int(state.report.points_used)} points"
                 frames.bar.set_postfix_str(text, refresh=False)
-    if not path_world or frames.next_frame < before.next_frame:  # nothing new was read
+    if not path_world or frames.next_frame < before.next_frame:  # what was read again is no result
         if isinstance(frames.stopped, StoppedError):
             frames.stopped.mapped = False
         raise frames.stopped or NothingMappedError(

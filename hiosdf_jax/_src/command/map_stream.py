@@ -28,13 +28,13 @@ from hiosdf_jax._src.output_files import replacing_together
 from hiosdf_jax._src.scoring.held_out import held_out_frames, score_held_out
 from hiosdf_jax._src.state.pytrees import MapState, field_of
 from hiosdf_jax._src.view import drawing
-from hiosdf_jax._src.view.growing import GrowingMap, save_growing
+from hiosdf_jax._src.view.growing import MapSoFar, save_growing
 
 if TYPE_CHECKING:
     import trimesh
 
 RESULTS = (*TRAJECTORY, "mesh.ply", "mesh.png", "slices.png", "growing.gif", "metrics.json")
-_STAGES = 12  # of the growing map, that growing.gif shows
+_PICTURES = 12  # of growing.gif
 
 
 def run_stream(
@@ -159,13 +159,11 @@ def run_stream(
             tracker.write(folder, up_world)
         described["total_s"] = time.perf_counter() - start
         report.write_json(folder / "metrics.json", described)
-    error = map_file.error or mapped.stopped
-    if error is None:
-        map_file.remove_unfinished()
     print(report.summarize(described))
     print(f"wrote {output}{os.sep} in {described['total_s']:.0f} s")
-    if error is not None:
+    if error := map_file.error or mapped.stopped:
         raise error
+    map_file.remove_unfinished()
     return described
 
 
@@ -173,7 +171,7 @@ class _Growing:
     """Meshes of the growing map, for `growing.gif`."""
 
     def __init__(self, frames: int, resolution: float) -> None:
-        self._due = set(np.rint(np.linspace(0, frames - 1, _STAGES)).astype(int).tolist())
+        self._due = set(np.rint(np.linspace(0, frames - 1, _PICTURES)).astype(int).tolist())
         self._resolution = resolution
         self._fused = 0
         self._meshes: list[tuple[int, trimesh.Trimesh]] = []
@@ -187,8 +185,8 @@ class _Growing:
     def save(self, path: Path, path_world: np.ndarray, up_world: np.ndarray) -> None:
         if self._meshes:
             before = len(path_world) - self._fused  # positions of the run that this one continues
-            stages = [GrowingMap(mesh, path_world[: before + k]) for k, mesh in self._meshes]
-            save_growing(path, stages, up_world)
+            maps = [MapSoFar(mesh, path_world[: before + k]) for k, mesh in self._meshes]
+            save_growing(path, maps, up_world)
 
 
 def _score(queries: CompiledQueries, mapped: Mapped, truth: GroundTruth) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,20 @@ class StoppedError(Exception):
 
 class OtherStreamError(ValueError):
     """The map to resume was made from other frames."""
+
+
+class StreamFrame(NamedTuple):
+    """A frame that can be used.
+
+    Attributes:
+        index: Its index in the stream.
+        cloud: (N, 3) m, sensor frame.
+        pose: (4, 4) T_world_sensor.
+    """
+
+    index: int
+    cloud: np.ndarray
+    pose: np.ndarray
 
 
 class StreamFrames:
@@ -76,12 +91,11 @@ class StreamFrames:
         """The digest of the frames so far."""
         return self._digest.text()
 
-    def read_next(self) -> tuple[int, np.ndarray, np.ndarray] | None:
+    def read_next(self) -> StreamFrame | None:
         """Reads the next frame that can be used.
 
         Returns:
-            Its index, its cloud (N, 3) m, sensor frame, and its pose (4, 4) T_world_sensor. None
-            at the end of the stream, or if `stopped` says why there are no more frames.
+            The frame. None at the end of the stream, or if `stopped` says why there are no more.
 
         Raises:
             OtherStreamError: The map to resume was made from other frames.
@@ -89,30 +103,33 @@ class StreamFrames:
         for i in self._numbers:
             self._check_frames_before(i)
             if reason := self._stop():
-                self.stopped = StoppedError(f"{reason} after {i} of {len(self._stream)} frames")
-                return None
+                return self._end(StoppedError(f"{reason} after {i} of {len(self._stream)} frames"))
             try:
                 cloud, pose = read_frame(self._stream, i)
             except BadFrameError as error:
                 if not self._skip_bad_frames:
-                    self.stopped = error
-                    return None
-                self._skip(error)
+                    return self._end(error)
+                self._digest.add(None, None)
+                self.next_frame = i + 1
+                self.skipped += 1
+                self.bar.write(str(error), file=sys.stderr)
                 continue
             self._digest.add(cloud, pose)
             self.next_frame = i + 1
-            return i, cloud, pose
+            return StreamFrame(i, cloud, pose)
         self._check_frames_before(len(self._stream))
         return None
 
-    def _skip(self, error: BadFrameError) -> None:
-        self._digest.add(None, None)
-        self.next_frame += 1
-        self.skipped += 1
-        self.bar.write(str(error), file=sys.stderr)
+    def _end(self, reason: BadFrameError | StoppedError) -> None:
+        self.stopped = reason
+        # The bar's own count is that of the last time it was drawn.
+        self.bar.update(self.next_frame - self.bar.n)
 
     def _check_frames_before(self, next_frame: int) -> None:
-        if next_frame == self._before.next_frame > 0 and self.digest() != self._before.digest:
+        """Compares the frames of the map to resume, once they are all read."""
+        if next_frame == 0 or next_frame != self._before.next_frame:
+            return
+        if self.digest() != self._before.digest:
             raise OtherStreamError(
                 f"the map was made from other frames than the first {next_frame} of this stream"
             )

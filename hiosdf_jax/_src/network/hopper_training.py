@@ -117,9 +117,20 @@ def factors(
         turns = (tiles - cell + grid - 1) // grid
 
         def compute_tile(turn: jax.Array, _: None) -> None:
-            start = (turn * grid + cell) * TILE + warpgroup * ROWS
-            places = (references, scratch, warpgroup, cell, turn, start)
-            _compute(_Tile(count, layers, blocks, parts, *places, interpret))
+            tile = _Tile(
+                count=count,
+                layers=layers,
+                blocks=blocks,
+                parts=parts,
+                reference=references,
+                scratch=scratch,
+                warpgroup=warpgroup,
+                cell=cell,
+                turn=turn,
+                start=(turn * grid + cell) * TILE + warpgroup * ROWS,
+                interpret=interpret,
+            )
+            _compute(tile)
 
         constants = [
             (references.first, scratch.first_rows),
@@ -127,8 +138,8 @@ def factors(
             (references.output, scratch.output_row),
         ]
         barriers = (scratch.filled, scratch.free, scratch.loaded)
-        weights, streamed = references.weights, scratch.streamed
-        share_work(compute_tile, turns, steps, constants, weights, streamed, barriers, interpret)
+        streams = (references.weights, scratch.streamed)
+        share_work(compute_tile, turns, steps, constants, *streams, barriers, interpret)
 
     def entry(*references: Any) -> None:
         room = (WARPGROUPS * 2, ROWS, width)
@@ -190,7 +201,7 @@ class _References(NamedTuple):
     inputs: Any
     angles: Any
     last: Any
-    input: Any
+    before_first: Any
     cosines: Any
     products: Any
 
@@ -245,11 +256,13 @@ class _Tile:
     interpret: Any
 
     def read(self, which: int, block: int, room: Any = None) -> jax.Array:
+        """Reads a block of the array 0 or 1 that came in, or of one that is in another room."""
         room = self.scratch.coming if room is None else room
         place = self._place_of(room, which, block)
         return gpu.load(place, layout=LAYOUT).astype(jnp.float32)
 
     def write(self, x: jax.Array, which: int, block: int) -> jax.Array:
+        """Writes a block of the array 0 or 1 that goes out; returns it as float16."""
         x = x.astype(jnp.float16)
         self._place_of(self.scratch.going, which, block)[...] = x
         return x
@@ -258,20 +271,25 @@ class _Tile:
         return room.at[self.warpgroup * 2 + which, :, pl.ds(block * COLUMNS, COLUMNS)]
 
     def fetch(self, which: int, source: Any) -> None:
+        """Begins to load the array 0 or 1 that comes in."""
         slot = self.warpgroup * 2 + which
         gpu.copy_gmem_to_smem(source, self.scratch.coming.at[slot], self.scratch.arrived.at[slot])
 
     def await_fetched(self, arrays: int) -> None:
+        """Waits until the first one or two arrays have come in."""
         for which in range(arrays):
             gpu.barrier_wait(self.scratch.arrived.at[self.warpgroup * 2 + which])
 
     def await_room(self) -> None:
+        """Waits until the arrays that go out may be written again."""
         gpu.wait_smem_to_gmem(0, wait_read_only=True)
 
     def await_sent(self) -> None:
+        """Waits until all that went out is in global memory."""
         gpu.wait_smem_to_gmem(0)
 
     def send(self, which: int, target: Any) -> None:
+        """Begins to store the array 0 or 1 that goes out."""
         gpu.copy_smem_to_gmem(self.scratch.going.at[self.warpgroup * 2 + which], target)
 
     def rows_of(self, reference: Any, index: Any) -> Any:
@@ -303,7 +321,7 @@ class _Tile:
 
         @pl.when(layer == 0)
         def _() -> None:
-            self.send(which, self.rows_of(self.reference.input, kind))
+            self.send(which, self.rows_of(self.reference.before_first, kind))
 
     def product(self, x: Blocks, number: Any) -> jax.Array:
         """Multiplies by the number-th (D, D) of weights that the tile uses."""

@@ -1,7 +1,7 @@
 """The one way in for numbers, clouds and poses: float32, or a ValueError that names the argument.
 
 Numbers of any real type and byte order are accepted. Strings, booleans, complex numbers, times and
-Python objects, among them whole numbers beyond 64 bits, do not.
+Python objects, among them whole numbers beyond 64 bits, are not.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def check_whole(name: str, value: Any, least: int, most: int = _MOST_WHOLE) -> N
         most: Its largest value.
 
     Raises:
-        ValueError: It is not a whole number, or out of range.
+        ValueError: It is not a whole number, or is out of range.
     """
     whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     if not (whole and int(value) >= least):
@@ -199,7 +199,7 @@ def checked_cloud(cloud: Any) -> np.ndarray:
     """Checks a cloud, and returns it as (N, 3) float32; masked elements are NaN.
 
     Raises:
-        ValueError: It is not an array of real numbers, or misshapen.
+        ValueError: It is not an array of real numbers, or is misshapen.
     """
     floats = as_floats("cloud", cloud)
     _check_cloud_shape(floats)

@@ -25,7 +25,7 @@ def check_map(
         batched: The call that does the same for a stack, for error messages.
 
     Raises:
-        ValueError: It is not a map, or a stack, or was donated.
+        ValueError: It is not a map, is a stack of maps, or was donated.
     """
     if not isinstance(state, MapState):
         raise ValueError(f"{name} is {type(state).__name__}, expected a MapState from hio.init")

@@ -21,8 +21,8 @@ _PATH_COLOR = (204, 60, 160)
 _DOT_PIXELS = 4  # radius of the dot where the sensor is
 
 
-class GrowingMap(NamedTuple):
-    """A map on its way.
+class MapSoFar(NamedTuple):
+    """A map that is still growing.
 
     Attributes:
         mesh: Its surface.
@@ -34,7 +34,7 @@ class GrowingMap(NamedTuple):
 
 
 def save_growing(
-    path: str | os.PathLike[str], stages: Sequence[GrowingMap], up_world: np.ndarray
+    path: str | os.PathLike[str], maps: Sequence[MapSoFar], up_world: np.ndarray
 ) -> None:
     """Draws how a map grows, with the path of the sensor, as an animated GIF.
 
@@ -43,17 +43,17 @@ def save_growing(
 
     Args:
         path: The file.
-        stages: The map at different times, oldest first, at least one.
+        maps: The map at different times, oldest first, at least one.
         up_world: (3,) unit vector against gravity.
 
     Raises:
         OSError: The file cannot be written.
     """
-    view = viewpoint(stages[-1].mesh, _SIZE, up_world) if len(stages[-1].mesh.faces) else None
+    view = viewpoint(maps[-1].mesh, _SIZE, up_world) if len(maps[-1].mesh.faces) else None
     if view is None:
         return
     pictures = []
-    for mesh, path_world in stages:
+    for mesh, path_world in maps:
         pictures.append(_with_path(shade(mesh, view), view.pixels(path_world)))
     # One palette for all, since each with its own would flicker. The path keeps its exact color.
     palette = pictures[-1].quantize(254)

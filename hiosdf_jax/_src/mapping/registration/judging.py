@@ -38,11 +38,11 @@ _ALLOWANCE = 0.02
 # well the returns that fit hold the pose along a ray is 1 / d^T N^-1 d, where N is the mean outer
 # product of their normals: 1 if all normals are along the ray, and a third if they point
 # everywhere. Along a tube it is 0, or 0.03 by chance. A blocked ray counts as the first weight at
-# 0, and as the second one from _FULL_SUPPORT on. A map that refuses a right pose never sees that
+# 0, and as the second one from _FULL_HOLD on. A map that refuses a right pose never sees that
 # something is gone.
 _GONE_WEIGHTS = 10.0, 0.5
-_FULL_SUPPORT = 0.05
-_LEAST_SUPPORT = 1e-3
+_FULL_HOLD = 0.05
+_LEAST_HOLD = 1e-3
 
 # A right pose rarely has both blocked rays and returns that do not fit, so the geometric mean of
 # the two counts most. One ray may be both: through a solid, and to a return in free space.
@@ -116,6 +116,6 @@ def _weigh_blocked(mean_product: jax.Array, offset: jax.Array) -> jax.Array:
         (N,).
     """
     direction = join(unit(split(offset)))
-    product = mean_product + _LEAST_SUPPORT * jnp.eye(3)
-    support = 1 / jnp.sum(direction * solve_positive(product, direction), axis=-1)
-    return jnp.asarray(between(_GONE_WEIGHTS, jnp.minimum(support / _FULL_SUPPORT, 1)))
+    product = mean_product + _LEAST_HOLD * jnp.eye(3)
+    hold = 1 / jnp.sum(direction * solve_positive(product, direction), axis=-1)
+    return jnp.asarray(between(_GONE_WEIGHTS, jnp.minimum(hold / _FULL_HOLD, 1)))
