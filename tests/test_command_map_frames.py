@@ -10,6 +10,8 @@ from room_files import BOX, RAYS, use_room_config, write_points
 
 from hiosdf_jax._src.command import cli, map_stream, report
 from hiosdf_jax._src.command.map_frames import fuse_frames
+from hiosdf_jax._src.command.progress import Progress
+from hiosdf_jax._src.command.stream_frames import StreamFrames
 from hiosdf_jax.datasets import NpzStream
 
 
@@ -43,6 +45,17 @@ def test_bad_frames_among_those_held_out(tmp_path):
     mapped = fuse_frames(stream, CONFIG, key, held_out=[1, 2])
     assert (int(mapped.state.updates), mapped.last_frame) == (1, 0)
     assert str(mapped.stopped).startswith("frame 2: ")
+
+
+def test_the_bar_ends_with_the_frames_that_were_read(tmp_path):
+    stream = NpzStream(write_points(tmp_path / "scans.npz", 8))
+    asked = iter([*[None] * 5, "SIGINT"])
+    frames = StreamFrames(stream, Progress(), skip_bad_frames=False, stop=lambda: next(asked))
+    with frames.bar:
+        while frames.read_next():
+            pass
+    assert str(frames.stopped) == "SIGINT after 5 of 8 frames"
+    assert (frames.next_frame, frames.bar.n) == (5, 5)
 
 
 def test_no_usable_frame(tmp_path, capsys, monkeypatch):
