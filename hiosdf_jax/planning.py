@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING
 from hiosdf_jax._src.planning.body import clearance_and_jacobian
 from hiosdf_jax._src.planning.clearance import sphere_clearance, sphere_clearance_and_grad
 from hiosdf_jax._src.planning.cost import collision_cost
+from hiosdf_jax._src.planning.robot.clearance import robot_clearance, robot_clearance_and_grad
 from hiosdf_jax._src.planning.robot.spheres import (
     BodyPoses,
     RobotSpheres,
     place_spheres,
-    robot_clearance,
-    robot_clearance_and_grad,
     spheres_from_model,
 )
 from hiosdf_jax._src.planning.sweep import swept_clearance, swept_clearance_and_grad

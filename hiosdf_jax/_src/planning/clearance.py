@@ -1,4 +1,4 @@
-"""Clearance of spheres; `robot.spheres` places those of a robot."""
+"""Checks spheres against the map; `robot.clearance` checks those of a robot."""
 
 from __future__ import annotations
 
