@@ -1,1 +1,1 @@
-"""Readers of recorded streams, one format per module; docs/architecture.md says how to add one."""
+"""Readers of recorded streams, one format per module; CONTRIBUTING.md says how to add one."""
