@@ -82,8 +82,7 @@ class StreamFrames:
         self._stream, self._before, self._stop = stream, before, stop
         self._skip_bad_frames = skip_bad_frames
         self._digest = FrameDigest()
-        self.bar = tqdm(range(len(stream)), desc="mapping", unit="frame")
-        self._numbers = iter(self.bar)
+        self.bar = tqdm(total=len(stream), desc="mapping", unit="frame")
         self.next_frame = self.skipped = 0
         self.stopped: BadFrameError | StoppedError | None = None
 
@@ -100,36 +99,34 @@ class StreamFrames:
         Raises:
             OtherStreamError: The map to resume was made from other frames.
         """
-        for i in self._numbers:
-            self._check_frames_before(i)
+        while True:
+            self.bar.update(self.next_frame - self.bar.n)
+            self._check_frames_before()
+            i, count = self.next_frame, len(self._stream)
+            if i == count:
+                return None
             if reason := self._stop():
-                return self._end(StoppedError(f"{reason} after {i} of {len(self._stream)} frames"))
+                self.stopped = StoppedError(f"{reason} after {i} of {count} frames")
+                return None
             try:
                 cloud, pose = read_frame(self._stream, i)
             except BadFrameError as error:
                 if not self._skip_bad_frames:
-                    return self._end(error)
+                    self.stopped = error
+                    return None
                 self._digest.add(None, None)
-                self.next_frame = i + 1
+                self.next_frame += 1
                 self.skipped += 1
                 self.bar.write(str(error), file=sys.stderr)
                 continue
             self._digest.add(cloud, pose)
-            self.next_frame = i + 1
+            self.next_frame += 1
             return StreamFrame(i, cloud, pose)
-        self._check_frames_before(len(self._stream))
-        return None
 
-    def _end(self, reason: BadFrameError | StoppedError) -> None:
-        self.stopped = reason
-        # The bar's own count is that of the last time it was drawn.
-        self.bar.update(self.next_frame - self.bar.n)
-
-    def _check_frames_before(self, next_frame: int) -> None:
+    def _check_frames_before(self) -> None:
         """Compares the frames of the map to resume, once they are all read."""
-        if next_frame == 0 or next_frame != self._before.next_frame:
-            return
-        if self.digest() != self._before.digest:
+        first = self._before.next_frame
+        if first > 0 and self.next_frame == first and self.digest() != self._before.digest:
             raise OtherStreamError(
-                f"the map was made from other frames than the first {next_frame} of this stream"
+                f"the map was made from other frames than the first {first} of this stream"
             )
