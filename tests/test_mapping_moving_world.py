@@ -116,6 +116,35 @@ def test_a_cloud_that_is_too_long_is_refused_and_not_one_that_is_right(sharp_map
     assert int(hio.update(after, cloud, pose).report.update_flags) == 0
 
 
+def seen_ahead(seed, count=250):
+    """Exact returns of a camera that looks along x from behind the middle of the room."""
+    rays = np.random.default_rng(seed).uniform(-0.7, 0.7, (count, 3))
+    rays[:, 0] = 1
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    pose = np.eye(4, dtype=np.float32)
+    pose[0, 3] = -0.4
+    reach = ((HALF * np.sign(rays) - pose[:3, 3]) / rays).min(axis=1)
+    return (rays * reach[:, None]).astype(np.float32), pose
+
+
+@pytest.mark.parametrize(
+    ("step", "turn"),
+    [((-0.5, 0, 0), 0), ((0.5, 0, 0), 0), ((0.2, -0.3, 0), 0), ((-0.4, 0.2, 0), 0.3)],
+)
+def test_a_cloud_at_a_wrong_pose_is_refused_and_the_same_at_the_right_one_is_not(
+    sharp_map, step, turn
+):
+    """Floor, ceiling and some walls still fit: most rays agree with the map."""
+    cloud, pose = seen_ahead(1)
+    assert int(hio.update(sharp_map, cloud, pose).report.update_flags) == 0
+    moved = pose.copy()
+    moved[:3, 3] += step
+    c, s = np.cos(turn), np.sin(turn)
+    moved[:2, :2] = [[c, -s], [s, c]]
+    after = hio.update(sharp_map, cloud, moved)
+    assert arrays_equal(after, flagged(sharp_map, hio.Flag.INCONSISTENT_CLOUD, refused=1))
+
+
 def flagged(state, flag, refused=0):
     """The same map with the flags of a cloud that was not fused."""
     report, flag = state.report, jnp.uint32(flag)

@@ -28,6 +28,7 @@ Rows = dict[str, measures.Figures]
 
 _HOUSE_FRAMES = 60
 _BURST_AFTER = 30  # frames
+_JUDGED_FROM = 5  # updates; a younger map refuses nothing
 _POOR_NOISE = 0.05  # m
 _LENS = 0.12  # m, how near the thing is that covers the lens
 _THROUGH_CLEAR, _THROUGH_TRUTH = 0.1, 0.05  # m, called clear and truly near
@@ -114,6 +115,7 @@ def run_faults(setup: Setup, folder: Path) -> Rows:
         rows[f"{stream.name}: {label}"] = _score(stream, clean, played.state) | {
             "false_alarms": _flagged(played.flags, clean.flags)
         }
+    rows |= _each_frame_displaced(setup, stream, clean)
     rows |= _millimeters_from_the_start(setup, stream, clean)
     rows |= _out_of_range(setup, stream, clean)
     return rows
@@ -145,12 +147,30 @@ def _random_clouds(stream: Stream, rng: np.random.Generator, count: int) -> list
 
 def _displaced(stream: Stream, rng: np.random.Generator) -> list[Frame]:
     heading = rng.uniform(0, 2 * np.pi)
-    frames = []
-    for frame in stream.frames[_BURST_AFTER - 5 : _BURST_AFTER]:
-        pose = np.array(frame.pose)
-        pose[:3, 3] += [np.cos(heading), np.sin(heading), 0]
-        frames.append(frame._replace(pose=pose))
-    return frames
+    return [_moved(frame, heading) for frame in stream.frames[_BURST_AFTER - 5 : _BURST_AFTER]]
+
+
+def _moved(frame: Frame, heading: float) -> Frame:
+    """A frame whose pose is 1 m off along the floor."""
+    pose = np.array(frame.pose)
+    pose[:3, 3] += [np.cos(heading), np.sin(heading), 0]
+    return frame._replace(pose=pose)
+
+
+def _each_frame_displaced(setup: Setup, stream: Stream, clean: Clean) -> Rows:
+    """Each frame is also given 1 m off, once the map can judge it; the map goes on without it."""
+    label = "each frame 1 m off"
+    flags = []
+
+    def look(index: int, before: hio.MapState, _: hio.MapState) -> None:
+        if index >= _JUDGED_FROM:
+            wrong = _moved(stream.frames[index], setup.rng(7, index).uniform(0, 2 * np.pi))
+            flags.extend(library.play(before, [wrong], label).flags)
+
+    library.play(
+        setup.new_map(setup.config(stream.bounds, stream.max_range)), stream.frames, label, look
+    )
+    return {f"{stream.name}: {label}": {"flagged": _flagged(flags, clean.flags)}}
 
 
 def _covered(stream: Stream, rng: np.random.Generator) -> list[Frame]:

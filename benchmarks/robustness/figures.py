@@ -113,6 +113,7 @@ BARS = (
     Bar("*: 10 clouds *", "error_ratio", 0, 1.1),
     Bar("*: 5 frames 1 m off", "flagged", 0.9, 1),
     Bar("*: 5 frames 1 m off", "error_ratio", 0, 1.1),
+    Bar("*: each frame 1 m off", "flagged", 0.9, 1),
     Bar("*: lens covered*", "flagged", 0.9, 1),
     Bar("*: lens covered*", "error_ratio", 0, 1.1),
     Bar("*: a pose 1e20 m away", "flagged", 0.9, 1),
