@@ -50,6 +50,25 @@ def test_beyond_the_horizon_the_network_answers_alone():
     assert np.abs(np.diff(value)).max() < 0.06  # no jump between the two
 
 
+@pytest.mark.parametrize("remembered_m", [-2.0, 2.0])
+def test_in_unseen_obstacles_what_the_network_remembers_does_not_count(remembered_m):
+    """It may remember free space where a thing is now: its gradient would hold points inside."""
+    config = dataclasses.replace(CONFIG, bounds=LARGER_BOUNDS)
+    field = hio.snapshot(map_of_room(config, jax.random.key(0)))
+    points = np.random.default_rng(1).uniform(*LARGER_BOUNDS, (2000, 3)).astype(np.float32)
+    answer = hio.query(field, points, "obstacle")
+    unseen = np.asarray(answer.frontier) < 0
+    assert unseen.sum() > 500
+    last = f"Dense_{CONFIG.hidden_layers + 1}"
+    layers = dict(field.params["params"])
+    layers[last] = layers[last] | {"bias": layers[last]["bias"] + remembered_m}
+    other = hio.query(field.replace(params={"params": layers}), points, "obstacle")
+    # The network corrects the grid by a tenth of its difference, of at most a voxel.
+    change = np.abs(np.asarray(other.sdf) - np.asarray(answer.sdf))[unseen]
+    assert change.max() < 0.021
+    assert (np.asarray(other.sdf) <= np.asarray(answer.frontier) + 1e-6)[unseen].all()
+
+
 def test_the_papers_map_is_the_network_alone(field):
     paper = field.replace(config=dataclasses.replace(CONFIG, grid_share=0.0))
     points = jnp.asarray(points_inside())

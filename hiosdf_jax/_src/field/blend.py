@@ -22,8 +22,9 @@ from hiosdf_jax._src.state.pytrees import Field, Unknown
 _FADE = (0.8, 1.0)
 
 # It fades out at these distances beyond observed space, voxels: space just behind a surface is
-# certainly solid. Where unseen space is an obstacle, the frontier bounds the grid's guess, and a
-# guess of the network could hold a point inside a solid.
+# certainly solid. Where unseen space is an obstacle, it fades to the frontier, which bounds it: the
+# network may still remember the free space in which a thing has appeared, and its gradient would
+# hold a point inside.
 _FADE_UNSEEN_VOXELS = {"network": (1.0, 3.0), "obstacle": (2.0, 4.0)}
 
 # Largest correction of the grid by the network, voxels: in unseen space the network is a guess.
@@ -160,4 +161,7 @@ def _combine(
     far = jnp.clip((jnp.abs(grid) - start) / (end - start), 0, 1)
     start, end = (voxels * config.voxel_size for voxels in _FADE_UNSEEN_VOXELS[unknown])
     unseen = jnp.clip((-frontier - start) / (end - start), 0, 1)
-    return near + jnp.maximum(far, unseen) * (network - near)
+    if unknown == "network":
+        return near + jnp.maximum(far, unseen) * (network - near)
+    near = near + far * (network - near)
+    return near + unseen * jnp.maximum(frontier - near, 0)
