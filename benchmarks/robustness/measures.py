@@ -29,6 +29,7 @@ _LOOKS = 12  # scans that are searched for the nearest surface of a point
 _VIEW = 0.0125  # rad, as near to a ray a surface counts as seen
 _GAP = 0.0175  # rad, half the gap between the rings of the LiDAR: nothing between them is unseen
 _TOUCH = 0.01  # m, a ray that comes as near to a point has met it
+_MET = 0.15  # m, a return as near to a surface has met it: on one that is seen edge-on none ends
 _DIFFERENCE = 1e-5  # m
 _WAKE_POINTS = 20_000
 _WAKE_TRUTH = 0.05  # m; nearer to the thing an error of its side would count
@@ -171,7 +172,8 @@ def seen_points(
     truth = world.distance(points)
     nearest = points - truth[:, None] * _gradient(world, points)
     poses = [each.pose for each in scans[:: -(-len(scans) // _LOOKS)]]
-    known = is_visible(sensor, poses, world, nearest)
+    met = KDTree(np.concatenate([each.exact_world for each in scans])).query(nearest)[0] < _MET
+    known = met & is_visible(sensor, poses, world, nearest)
     return points[known], truth[known]
 
 
