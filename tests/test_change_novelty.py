@@ -164,7 +164,7 @@ def test_a_cloud_that_contradicts_the_map_is_found(grid, name):
     # A young map cannot judge.
     assert bool(compare(grid, rays, 4).consistent)
     # Returns in unseen space say nothing, and too few others not enough.
-    beyond = uniform(6, 9000, (0.83, 0.01, 0.21), (0.89, 0.99, 0.99))
+    beyond = uniform(6, 4000, (0.83, 0.01, 0.21), (0.89, 0.99, 0.99))
     few = rays_to(np.concatenate([points, beyond]), SENSOR)
     assert bool(compare(grid, few).consistent)
 

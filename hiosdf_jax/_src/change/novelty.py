@@ -72,6 +72,6 @@ def compare_cloud(config: Config, grid: Grid, rays: Rays, updates: jax.Array) ->
     novel = ends & empty & (free | ((passes < 0) & near_new))
 
     # New things move on: returns near them are expected, and say nothing about the whole cloud.
-    compared = Compared(observed & ~near_new, novel, jnp.abs(sdf), patch)
+    compared = Compared(observed & ~near_new, novel, jnp.abs(sdf))
     verdict = judge(config, grid, rays, updates, compared)
     return Novelty(novel, ends & near_new, verdict.consistent, verdict.noise)

@@ -2,7 +2,8 @@
 
 Near surfaces the grid's patches are more accurate, and the network smooths the edges between them.
 Beyond the grid's horizon the answer fades to that of the network. It also does so in unseen space,
-where the grid guesses the side of a surface and the guess may jump.
+where the grid guesses the side of a surface and the guess may jump. Where unseen space is an
+obstacle, it fades to the frontier there.
 
 `lattice` has the same four functions for a baked field: `bounds`, `sdf`, `frontier`, `lower`.
 """
@@ -22,9 +23,8 @@ from hiosdf_jax._src.state.pytrees import Field, Unknown
 _FADE = (0.8, 1.0)
 
 # It fades out at these distances beyond observed space, voxels: space just behind a surface is
-# certainly solid. Where unseen space is an obstacle, it fades to the frontier, which bounds it: the
-# network may still remember the free space in which a thing has appeared, and its gradient would
-# hold a point inside.
+# certainly solid. The network may still remember the free space in which a thing has appeared. Its
+# gradient would point into the thing, so an obstacle's distance fades to the frontier.
 _FADE_UNSEEN_VOXELS = {"network": (1.0, 3.0), "obstacle": (2.0, 4.0)}
 
 # Largest correction of the grid by the network, voxels: in unseen space the network is a guess.

@@ -44,7 +44,7 @@ def sdf(field: AnyField, points: Any, unknown: Unknown = "network") -> jax.Array
         unknown: Policy for unseen space. "network" returns the map's prediction there. "obstacle"
             treats unseen space as solid: the result is min(sdf, frontier) in observed space and,
             from 40 cm deep in unseen space on, the frontier's negative distance alone. Between
-            them the grid's guess counts more than the network's.
+            them the grid's guess fades to the frontier.
 
     Returns:
         (...) float32, m; positive in free space, negative behind surfaces. Differentiable.

@@ -1,0 +1,107 @@
+"""Whether a cloud fits the map better at another pose nearby: then its own pose is wrong.
+
+A person who steps aside and a pose that is 1 m off make as many rays wrong. But no other pose
+explains the person, and the right one explains nearly all wrong rays of the other cloud.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.grid import geometry
+from hiosdf_jax._src.grid.rays import Rays
+from hiosdf_jax._src.numerics.masks import indices_of_true, rank_mask
+from hiosdf_jax._src.numerics.vectors import split
+from hiosdf_jax._src.state.pytrees import Grid
+
+_RAYS = 256
+
+# Steps along x and y, and turns about z, from the given pose.
+_COARSE_M, _COARSE_DEGREES = np.linspace(-1.2, 1.2, 9), np.linspace(-20, 20, 5)
+# The same from each of the best of them.
+_FINE_M, _FINE_DEGREES = np.linspace(-0.15, 0.15, 4), np.linspace(-5, 5, 5)
+_BEST = 4
+
+# The best of the coarse poses have the least mean distance of the returns. Each counts up to the
+# first distance, and as the second one in unseen space.
+_MOST_M, _UNSEEN_M = 0.4, 0.24
+
+# Of the fine ones, the one at which most returns agree with the map: up to a voxel, or this.
+_AGREEING_M = 0.1
+
+# A cloud is misplaced if another pose makes this many more of its returns agree, per wrong ray. On
+# 288 changes of a room (people, doors and wardrobes that appear, leave or move) it is 0.66 at most.
+_LEAST_EXPLAINED = 0.7
+# A board before the sensor fits a wall elsewhere, but what is seen beside it does not. So at the
+# other pose this share of all returns agrees, and this share of those that agree at the given one.
+_LEAST_AGREE = 0.5
+_LEAST_KEPT = 0.8
+
+
+def is_misplaced(config: Config, grid: Grid, rays: Rays, wrong: jax.Array) -> jax.Array:
+    """Searches for a pose that explains the wrong rays of a cloud.
+
+    Args:
+        config: The map's configuration.
+        grid: The grid before the cloud is fused.
+        rays: The cloud, or some rays of it.
+        wrong: Rays that end in free space or go through walls, (N,) bool.
+
+    Returns:
+        () bool. Poses up to 1.35 m away along x and along y, and 25 degrees about z, are found.
+    """
+    usable = rays.ends & rays.inside
+    ranked = rank_mask(usable)
+    row = indices_of_true(ranked, (jnp.arange(_RAYS, dtype=jnp.int32) * ranked.total) // _RAYS)
+    row = jnp.minimum(row, usable.size - 1)
+    chosen = usable[row]
+    offset = rays.points_world[row] - rays.sensor_world
+    sdf, steps = grid.derived.sdf.ravel(), grid.derived.frontier_steps.ravel()
+
+    def distance_after(move: jax.Array) -> jax.Array:
+        """Distances of the returns from the nearest surface; inf in unseen space."""
+        x, y, turn = move
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        turned = cos * offset[:, 0] - sin * offset[:, 1], sin * offset[:, 0] + cos * offset[:, 1]
+        moved = jnp.stack([turned[0] + x, turned[1] + y, offset[:, 2]], axis=-1)
+        index, _, inside = geometry.voxel_of(config, rays.sensor_world + moved)
+        voxel = geometry.flat_index(config.grid_shape, split(index))
+        seen = chosen & inside & (steps[voxel] > 0)
+        return jnp.where(seen, jnp.abs(sdf[voxel].astype(jnp.float32)), jnp.inf)
+
+    def misfit(move: jax.Array) -> jax.Array:
+        distance = distance_after(move)
+        counted = jnp.where(jnp.isinf(distance), _UNSEEN_M, jnp.minimum(distance, _MOST_M))
+        return jnp.sum(jnp.where(chosen, counted, 0))
+
+    def agrees(move: jax.Array) -> jax.Array:
+        return distance_after(move) < max(config.voxel_size, _AGREEING_M)
+
+    here = agrees(jnp.zeros(3, jnp.float32))
+
+    def best_around(move: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """How many returns agree at the best fine pose, and how many of those that do `here`."""
+        agree = jax.vmap(agrees)(move + _moves(_FINE_M, _FINE_DEGREES))
+        count = jnp.sum(agree, axis=1)
+        best = jnp.argmax(count)
+        return count[best], jnp.sum(agree[best] & here)
+
+    coarse = _moves(_COARSE_M, _COARSE_DEGREES)
+    _, best = jax.lax.top_k(-jax.lax.map(misfit, coarse, batch_size=len(_COARSE_M) ** 2), _BEST)
+    counts, kept_each = jax.lax.map(best_around, coarse[best])
+    count, kept = jnp.max(counts), kept_each[jnp.argmax(counts)]
+    explains = count - jnp.sum(here) > _LEAST_EXPLAINED * jnp.sum(wrong[row] & chosen)
+    return (
+        explains & (count >= _LEAST_AGREE * jnp.sum(chosen)) & (kept >= _LEAST_KEPT * jnp.sum(here))
+    )
+
+
+def _moves(steps_m: np.ndarray, degrees: np.ndarray) -> jax.Array:
+    """Returns all steps along x and y with all turns, (K, 3): m, m and rad."""
+    moves = itertools.product(steps_m, steps_m, np.radians(degrees))
+    return jnp.asarray(np.array(list(moves)), jnp.float32)
