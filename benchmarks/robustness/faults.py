@@ -165,11 +165,10 @@ def _each_frame_displaced(setup: Setup, stream: Stream, clean: Clean) -> Rows:
     def look(index: int, before: hio.MapState, _: hio.MapState) -> None:
         if index >= _JUDGED_FROM:
             wrong = _moved(stream.frames[index], setup.rng(7, index).uniform(0, 2 * np.pi))
-            flags.extend(library.play(before, [wrong], label).flags)
+            flags.extend(library.play(before, [wrong], f"{stream.name}: {label}").flags)
 
-    library.play(
-        setup.new_map(setup.config(stream.bounds, stream.max_range)), stream.frames, label, look
-    )
+    state = setup.new_map(setup.config(stream.bounds, stream.max_range))
+    library.play(state, stream.frames, f"{stream.name}: {label}", look)
     return {f"{stream.name}: {label}": {"flagged": _flagged(flags, clean.flags)}}
 
 

@@ -29,7 +29,7 @@ _LOOKS = 12  # scans that are searched for the nearest surface of a point
 _VIEW = 0.0125  # rad, as near to a ray a surface counts as seen
 _GAP = 0.0175  # rad, half the gap between the rings of the LiDAR: nothing between them is unseen
 _TOUCH = 0.01  # m, a ray that comes as near to a point has met it
-_MET = 0.15  # m, a return as near to a surface has met it: on one that is seen edge-on none ends
+_MET = 0.15  # m, a return as near to a surface has met it; none ends on one that is seen edge-on
 _DIFFERENCE = 1e-5  # m
 _WAKE_POINTS = 20_000
 _WAKE_TRUTH = 0.05  # m; nearer to the thing an error of its side would count
@@ -151,7 +151,8 @@ def seen_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws points of free space on the rays of scans, where the nearest surface was seen too.
 
-    Nothing can be known of a surface that no ray has met, so no map can be scored on it.
+    Nothing can be known of a surface that no ray has met, so no map can be scored on it. A surface
+    counts as met up to 15 cm from a return: not the floor between distant rings of a LiDAR.
 
     Args:
         sensor: The sensor.

