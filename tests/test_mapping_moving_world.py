@@ -129,7 +129,7 @@ def seen_ahead(seed, count=250):
 
 @pytest.mark.parametrize(
     ("step", "turn"),
-    [((-0.5, 0, 0), 0), ((0.5, 0, 0), 0), ((0.2, -0.3, 0), 0), ((-0.4, 0.2, 0), 0.3)],
+    [((0.5, 0, 0), 0), ((0.5, -0.3, 0), 0), ((-0.5, 0.2, 0), 0.3)],
 )
 def test_a_cloud_at_a_wrong_pose_is_refused_and_the_same_at_the_right_one_is_not(
     sharp_map, step, turn
