@@ -188,15 +188,16 @@ def test_points_outside_have_not_been_seen(room_map):
 def test_unseen_space_is_an_obstacle_on_request(room_map):
     points = np.random.default_rng(2).uniform(-1.4, 1.4, (2000, 3)).astype(np.float32)
     plain, solid = hio.query(room_map, points), hio.query(room_map, points, unknown="obstacle")
-    # Up to 20 cm deep the grid decides, from 40 cm on the network; beyond the bounds as at them.
+    # Up to 20 cm deep the grid decides, from 40 cm on the frontier; beyond the bounds as at them.
     inside = np.clip(points, *BOUNDS)
     grid = np.asarray(grid_sdf(room_map.grid, inside), np.float64)
     network = np.asarray(network_sdf(hio.snapshot(room_map), inside), np.float64)
     limit = np.minimum(0.1, np.abs(grid))
     near = grid + 0.1 * np.clip(network - grid, -limit, limit)
     far = np.clip((np.abs(grid) - 0.8) / 0.2, 0, 1)
-    unseen = np.clip((-np.asarray(hio.query(room_map, inside).frontier) - 0.2) / 0.2, 0, 1)
-    value = near + np.maximum(far, unseen) * (network - near)
+    there = np.asarray(hio.query(room_map, inside).frontier, np.float64)
+    value = near + far * (network - near)
+    value += np.clip((-there - 0.2) / 0.2, 0, 1) * np.maximum(there - value, 0)
     value -= np.linalg.norm(points - inside, axis=1)
     expected = np.minimum(value, plain.frontier)
     # From 0 to 40 cm deep in unseen space the frontier takes over: its gradient leads out.
