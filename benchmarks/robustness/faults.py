@@ -158,7 +158,7 @@ def _moved(frame: Frame, heading: float) -> Frame:
 
 
 def _each_frame_displaced(setup: Setup, stream: Stream, clean: Clean) -> Rows:
-    """Each frame is also given 1 m off, once the map can judge it; the map goes on without it."""
+    """Updates a copy of the map with each frame at a pose 1 m off, once the map can judge it."""
     label = "each frame 1 m off"
     flags = []
 

@@ -45,9 +45,9 @@ _LEAST_BESIDE = 0.75
 _MOST_PIERCING = 0.05
 _AGREEING_VOXELS = 1.0
 
-# A wall seems to come nearer where a board appears, and where the pose is too far ahead. A board
-# that is missing in the map is the greater danger. So the cloud is news, if even fewer rays go
-# through walls, and nearly all beside it agree.
+# A board that appears looks like a wall that is seen from a pose too far ahead. A board that is
+# missing in the map is the greater danger. So the cloud is news if even fewer rays go through walls
+# and nearly all returns beside it agree.
 _MOST_PIERCING_ELSEWHERE = 0.02
 _LEAST_BESIDE_ELSEWHERE = 0.9
 

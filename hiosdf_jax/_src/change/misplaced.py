@@ -43,8 +43,9 @@ _LEAST_EXPLAINED = 0.7
 # other pose this share of all returns agrees, and this share of those that agree at the given one.
 _LEAST_AGREE = 0.5
 _LEAST_KEPT = 0.8
-# On a plain or before a single wall, another pose explains a thing that has moved. Things move less
-# than this between two scans: so far the ends of the wrong rays are moved, on average.
+# On a plain, or in front of a single wall, another pose explains a thing that has moved. A thing
+# rarely moves this far between two scans. So the other pose must move the ends of the wrong rays at
+# least this far on average.
 _LEAST_WAY_M = 0.5
 
 
