@@ -100,7 +100,8 @@ def patch_at(grid, cell, point):
     for axis in axes[:2]:
         half = 0.9 * 3**0.5 * axis
         offset = offset - np.clip(offset @ half / (half @ half), -1, 1) * half
-    return np.linalg.norm(offset), height
+    inside = np.clip(point - offset, cell, np.array(cell) + 1)
+    return np.linalg.norm(point - inside), height
 
 
 def space_around(derived, corners, own):
@@ -140,12 +141,14 @@ def slow_distance(grid, point_world):
             value = abs(height)
         else:
             value = max(1.5 * height, -distance) if height < 0 else height
-        limit = max(min(distance, 0.34 - 1.4 * (distance - 0.34)), -distance)
+        limit = max(min(distance, 0.25 - 1.2 * (distance - 0.25)), -distance)
         free, behind = shares[Side.FREE], shares[Side.BEHIND]
         value = free * max(value, -limit) + behind * min(value, limit) + shares["other"] * value
-        found.append((max(weight, 1e-6) * np.exp(-distance / 0.15), value))
-    weights, values = zip(*found, strict=True)
-    return 0.1 * np.dot(weights, values) / np.sum(weights)
+        found.append((max(weight, 1e-6), distance / 0.14, value))
+    weights, lags, values = map(np.array, zip(*found, strict=True))
+    near, even = weights * np.exp(-lags), weights * np.exp(-0.35 * lags)
+    size = np.dot(near, np.abs(values)) / near.sum()
+    return 0.1 * size * np.dot(even, values) / np.dot(even, np.abs(values))
 
 
 @pytest.mark.parametrize("seen", ["nothing", "room", "anything"])
