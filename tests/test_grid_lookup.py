@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from interpreted import clear, interpret_point_kernels
+from interpreted import clear, interpret_point_kernels, lowered
 from voxels import (
     BOUNDS,
     CONFIG,
@@ -285,6 +285,21 @@ def test_the_kernel_of_a_gpu_answers_as_xla_does(room, monkeypatch):
     clear()
     for value, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(value, other, atol=1e-4)
+
+
+def test_all_lookups_can_be_lowered_for_a_gpu(room, monkeypatch):
+    """Triton has fewer operations than the interpreter."""
+    surface, points = surface_of(room), jnp.asarray(uniform(5, 4096))
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
+    clear()
+    for find in (lookup.grid_sdf, lookup.doubt_distance, lookup.frontier_distance):
+
+        def value(points, find=find):
+            return find(CONFIG, surface, points)
+
+        assert "gpu.triton" in lowered(value, points)
+        assert "gpu.triton" in lowered(jax.grad(lambda points, f=value: f(points).sum()), points)
+    clear()
 
 
 def test_several_maps_of_a_gpu_are_looked_up_under_a_condition(room, monkeypatch):

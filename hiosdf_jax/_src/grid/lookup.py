@@ -129,7 +129,7 @@ def nearest_patch_at(
     weight = weight / jnp.where(any_found, jnp.sum(weight, axis=0), 1)
     sdf = jnp.sum(weight * value, axis=0)
 
-    differ = jnp.any(value > 0, axis=0) & jnp.any(value < 0, axis=0)
+    differ = (jnp.max(value, axis=0) > 0) & (jnp.min(value, axis=0) < 0)
     size = jnp.abs(value)
     share = share * jnp.exp(-_SIGN_POWER * lag)
     sign = jnp.sum(share * value, axis=0) / jnp.where(differ, jnp.sum(share * size, axis=0), 1)
