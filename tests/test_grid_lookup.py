@@ -100,7 +100,7 @@ def patch_at(grid, cell, point):
     for axis in axes[:2]:
         half = 0.9 * 3**0.5 * axis
         offset = offset - np.clip(offset @ half / (half @ half), -1, 1) * half
-    inside = np.clip(point - offset, cell, np.array(cell) + 1)
+    inside = np.clip(point - offset, np.array(cell) - 0.1, np.array(cell) + 1.1)
     return np.linalg.norm(point - inside), height
 
 
@@ -141,12 +141,15 @@ def slow_distance(grid, point_world):
             value = abs(height)
         else:
             value = max(1.5 * height, -distance) if height < 0 else height
-        limit = max(min(distance, 0.25 - 1.2 * (distance - 0.25)), -distance)
+        limit = max(min(distance, 0.4 - 1.4 * (distance - 0.4)), -distance)
         free, behind = shares[Side.FREE], shares[Side.BEHIND]
         value = free * max(value, -limit) + behind * min(value, limit) + shares["other"] * value
-        found.append((max(weight, 1e-6), distance / 0.14, value))
-    weights, lags, values = map(np.array, zip(*found, strict=True))
-    near, even = weights * np.exp(-lags), weights * np.exp(-0.35 * lags)
+        found.append((max(weight, 1e-6), distance, value))
+    weights, distances, values = map(np.array, zip(*found, strict=True))
+    near = weights * np.exp(-distances / 0.14)
+    away = np.dot(near, distances) / near.sum()
+    power = np.interp(away, [0.2, 0.45], [1, 0.3])
+    even = weights * np.exp(-power * distances / 0.14)
     size = np.dot(near, np.abs(values)) / near.sum()
     return 0.1 * size * np.dot(even, values) / np.dot(even, np.abs(values))
 

@@ -88,7 +88,7 @@ def slow_lies_on(window, other, counts):
             for axis in other_axes[*near][:2]:
                 half = 0.9 * 3**0.5 * axis
                 apart = apart - np.clip(apart @ half / (half @ half), -1, 1) * half
-            apart = point - np.clip(point - apart, -0.5, 0.5)
+            apart = point - np.clip(point - apart, -0.6, 0.6)
             facing = axes[*cell][2] @ other_axes[*near][2] > 0
             found[*cell] |= bool(np.linalg.norm(apart) < 0.7 and facing)
     return found

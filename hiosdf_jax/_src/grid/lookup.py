@@ -34,18 +34,20 @@ from hiosdf_jax._src.state.pytrees import NO_FEATURE, Derived, Side, Surface, fr
 # much leaves more steps where the eight voxels change.
 _SOFT_VOXELS = 0.14
 
-# Where signs differ, the sign is a mean with the weights to this power. Otherwise the distance
-# would fall steeply from one sign to the other.
-_SIGN_POWER = 0.35
+# Where signs differ, the sign is a mean of its own. Next to patches it has the weights of the
+# distance. Away from them, between these distances, voxels, it has the weights to a power that
+# falls to this one: otherwise the distance would fall steeply from one sign to the other.
+_SIGN_POWER = 0.3
+_SIGN_VOXELS = (0.2, 0.45)
 
 # The only patch around a point counts also where its trilinear weight is 0.
 _LEAST_WEIGHT = 1e-6
 
 # A patch whose sign differs from that of the space around the point counts up to the first
-# distance, voxels. From there on its distance falls by the slope, is 0 within half a voxel, and
-# ends with the sign of the space.
-_OWN_SIGN_VOXELS = 0.25
-_OWN_SIGN_SLOPE = 1.2
+# distance, voxels. From there on its distance falls by the slope, is 0 within 0.7 voxels, and ends
+# with the sign of the space.
+_OWN_SIGN_VOXELS = 0.4
+_OWN_SIGN_SLOPE = 1.4
 
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
 # patch, the height alone would be too near.
@@ -131,7 +133,9 @@ def nearest_patch_at(
 
     differ = (jnp.max(value, axis=0) > 0) & (jnp.min(value, axis=0) < 0)
     size = jnp.abs(value)
-    share = share * jnp.exp(-_SIGN_POWER * lag)
+    start, end = _SIGN_VOXELS
+    away = jnp.clip((jnp.sum(weight * distance, axis=0) - start) / (end - start), 0, 1)
+    share = share * jnp.exp(-(1 + away * (_SIGN_POWER - 1)) * lag)
     sign = jnp.sum(share * value, axis=0) / jnp.where(differ, jnp.sum(share * size, axis=0), 1)
     sdf = jnp.where(differ, sign * jnp.sum(weight * size, axis=0), sdf)
     spread = jnp.sum(weight * patch.spread, axis=0)

@@ -25,6 +25,10 @@ from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
 # stream, 0.71 instead of 0.73 cm on a LiDAR stream.
 EXTENT_DEVIATIONS = 0.9 * 3**0.5
 
+# A patch may reach this far out of its voxel, voxels. Otherwise narrow gaps open between patches, and
+# the distances before surfaces that a LiDAR saw are 0.03 cm larger on average.
+_BEYOND_VOXEL = 0.1
+
 # Shorter axes (voxels) are stored with this length, so that a perfect plane keeps its normal.
 _LEAST_DEVIATION = 1e-3
 
@@ -258,7 +262,7 @@ def nearest_on_patch(
     A patch is the rectangle around `mean` that its two longest principal axes span. One or both
     axes are short for rods and single hits. The axes of a square turn with the noise, so the
     rectangle's corners may lie outside of the voxel, where no hit was. The rectangle's nearest
-    point is therefore moved into the voxel.
+    point is therefore moved into the voxel, or to a tenth of a voxel from it.
 
     Args:
         point: Voxels.
@@ -278,8 +282,9 @@ def nearest_on_patch(
         along = jnp.clip(share, -1, 1)
         offset = each(lambda o, h, along=along: o - along * h, offset, half)
         spans.append((half, jnp.where(share == along, 1 / square, 0)))
+    most = 0.5 + _BEYOND_VOXEL
     inside = each(
-        lambda p, o, c: jnp.clip(p - o, c - 0.5, c + 0.5) - (p - o), point, offset, center
+        lambda p, o, c: jnp.clip(p - o, c - most, c + most) - (p - o), point, offset, center
     )
     offset = each(jnp.subtract, offset, inside)
     away = jnp.maximum(length(offset), 1e-9)
