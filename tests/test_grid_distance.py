@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hiosdf_jax._src.grid import distance, evidence
+from hiosdf_jax._src.grid import distance
 from hiosdf_jax._src.state.pytrees import Side
 
 # The center of the one voxel lies half a voxel in front of a plane, or behind it.
@@ -36,12 +36,12 @@ def test_the_plane_decides_near_a_sure_patch_and_the_rays_elsewhere(name):
     axes = [jnp.asarray(axis)[:, None] for axis in ([0.4, 0, 0], [0, 0.4, 0], [0, 0, 0.05])]
     counts = [jnp.zeros(shape).at[1, 1, 8].set(count) for count in (passes, behind)]
     offset = tuple(jnp.asarray([value]) for value in (0.0, 0.0, height))
-    sure = jnp.asarray([hits >= evidence.SURE_HITS])
+    sure = jnp.asarray([hits >= distance._SURE_HITS])
     marked = jnp.asarray([abs(height) < distance._HIDDEN_REACH_VOXELS])
     sign, side = distance._side(*counts, here, offset, *map(tuple, axes[1:]), sure, marked)
     value = float(sign[0]) or 1.0  # no side at all counts as free
     assert value == expected
-    by_plane = hits >= evidence.SURE_HITS and abs(height) < 1 and "all rays" not in name
+    by_plane = hits >= distance._SURE_HITS and abs(height) < 1 and "all rays" not in name
     by_plane |= name == "in front, near, all rays end before it"
     assert int(side[0]) == (Side.PLANE if by_plane else int(sign[0]))
 

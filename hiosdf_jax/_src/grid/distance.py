@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
-from hiosdf_jax._src.grid.evidence import FREE_RATIO, SURE_HITS, is_free
+from hiosdf_jax._src.grid.evidence import FREE_RATIO, is_free
 from hiosdf_jax._src.grid.nearest import Part, nearest_sites
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
@@ -26,6 +26,9 @@ _SHEET_VOXELS = 2.0
 
 # Where no ray passed, the plane of a patch decides the side up to this distance, voxels.
 _GUESS_VOXELS = 3.0
+
+# The plane of a patch of fewer hits is uncertain: its normal may face away from the sensor.
+_SURE_HITS = 10.0
 
 # A patch fills its voxel or lies beside it where the nearest point to the voxel's center is at most
 # this far along its plane, voxels. Farther on is the edge of a surface, where the rays decide.
@@ -103,7 +106,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     mean = each(jnp.add, take(means, row), jump)
     here_zero = each(jnp.zeros_like, mean)
     offset = patches.nearest_on_patch(here_zero, mean, (long, middle), jump).offset
-    sure = hits.ravel()[row] >= SURE_HITS
+    sure = hits.ravel()[row] >= _SURE_HITS
     marked = squared < _HIDDEN_REACH_VOXELS**2
     sign, side = _side(passes, behind, here, offset, middle, short, sure, marked)
     signed_m = sign * length(offset) * config.voxel_size

@@ -18,12 +18,9 @@ _STORED = jnp.float16
 # Rounding to float16 multiplies a number by at most 1 + 2^-11 = 1.0005.
 _ROUNDING = 1.0007
 
-# A voxel is free with at least this many passes per ray that ended just before it: noise puts some
-# ends of rays too far away.
+# A voxel is free with at least this many passes per ray that ended just before it, and holds a
+# surface with at least this many hits: noise puts some ends of rays too far away.
 FREE_RATIO = 0.1
-
-# The plane of a patch of fewer hits is uncertain: its normal may face away from the sensor.
-SURE_HITS = 10.0
 
 
 class EvidenceWindow(NamedTuple):
@@ -213,7 +210,7 @@ def is_observed(config: Config, passes: jax.Array, hits: jax.Array, behind: jax.
     Returns:
         (...) bool.
     """
-    surface = (hits >= config.min_hits) & ((hits >= SURE_HITS) | (hits >= behind))
+    surface = (hits >= config.min_hits) & (hits >= FREE_RATIO * behind)
     return (passes >= 0) & (is_free(passes, behind) | surface)
 
 

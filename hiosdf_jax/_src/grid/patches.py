@@ -25,8 +25,8 @@ from hiosdf_jax._src.numerics.vectors import Vector, dot, each, length, split
 # stream, 0.71 instead of 0.73 cm on a LiDAR stream.
 EXTENT_DEVIATIONS = 0.9 * 3**0.5
 
-# A patch may reach this far out of its voxel, voxels. Otherwise narrow gaps open between patches, and
-# the distances before surfaces that a LiDAR saw are 0.03 cm larger on average.
+# A patch may reach this far out of its voxel, voxels. Otherwise narrow gaps open between patches,
+# and the distances before surfaces that a LiDAR saw are 0.03 cm larger on average.
 _BEYOND_VOXEL = 0.1
 
 # Shorter axes (voxels) are stored with this length, so that a perfect plane keeps its normal.
