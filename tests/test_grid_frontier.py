@@ -30,9 +30,7 @@ def brute_force(inside, reach):
 
 
 def observed_voxels(state):
-    seen = state.grid.evidence
-    counts = (array.astype(jnp.float32) for array in (seen.passes, seen.hits, seen.behind))
-    return np.asarray(is_observed(state.config, *counts))
+    return np.asarray(is_observed(state.grid.evidence.passes, state.grid.evidence.hits))
 
 
 @settings(max_examples=15, deadline=None)

@@ -18,10 +18,6 @@ _STORED = jnp.float16
 # Rounding to float16 multiplies a number by at most 1 + 2^-11 = 1.0005.
 _ROUNDING = 1.0007
 
-# A voxel is free with at least this many passes per ray that ended just before it, and holds a
-# surface with at least this many hits: noise puts some ends of rays too far away.
-FREE_RATIO = 0.1
-
 
 class EvidenceWindow(NamedTuple):
     """The evidence that one cloud can change.
@@ -166,7 +162,7 @@ def clear_patches(window: EvidenceWindow, voxels: jax.Array, change: int) -> Evi
     )
 
 
-def is_reached(passes: jax.Array, hits: jax.Array) -> jax.Array:
+def is_observed(passes: jax.Array, hits: jax.Array) -> jax.Array:
     """Returns a mask of the voxels that a ray has reached.
 
     Args:
@@ -177,41 +173,6 @@ def is_reached(passes: jax.Array, hits: jax.Array) -> jax.Array:
         (...) bool.
     """
     return (passes > 0) | ((hits > 0) & (passes >= 0))
-
-
-def is_free(
-    passes: jax.Array, behind: jax.Array, ratio: jax.Array | float = FREE_RATIO
-) -> jax.Array:
-    """Returns a mask of the voxels that rays have shown to be free.
-
-    Args:
-        passes: Rays that went through the voxel, (...).
-        behind: Rays that ended a little before it, (...).
-        ratio: Least passes per ray that ended before the voxel, (...).
-
-    Returns:
-        (...) bool.
-    """
-    return (passes > 0) & (passes >= ratio * behind)
-
-
-def is_observed(config: Config, passes: jax.Array, hits: jax.Array, behind: jax.Array) -> jax.Array:
-    """Returns a mask of the voxels that rays have shown to be free or to hold a surface.
-
-    A few rays reach the voxels behind a surface, through noise or past an edge. They do not show
-    on which side of the surface such a voxel lies.
-
-    Args:
-        config: The map's configuration.
-        passes: Rays that went through the voxel, (...); negative where it is hidden again.
-        hits: Rays that ended in it, (...).
-        behind: Rays that ended a little before it, (...).
-
-    Returns:
-        (...) bool.
-    """
-    surface = (hits >= config.min_hits) & (hits >= FREE_RATIO * behind)
-    return (passes >= 0) & (is_free(passes, behind) | surface)
 
 
 def rounded(values: jax.Array) -> jax.Array:

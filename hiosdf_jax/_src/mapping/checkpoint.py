@@ -14,7 +14,7 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
-from hiosdf_jax._src.grid.derived import recompute_derived
+from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.mapping.lifecycle import init
 from hiosdf_jax._src.mapping.stored_values import check_array, check_grid
 from hiosdf_jax._src.numerics.intake import is_traced
@@ -23,7 +23,7 @@ from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.pytrees import Grid, MapState
 
 _FORMAT = "hiosdf_jax map"
-_VERSION = 5
+_VERSION = 4
 
 # Names in the file are part of its format; attributes of the code may be renamed.
 _FILE_NAMES = {
@@ -170,8 +170,8 @@ def load(path: str | os.PathLike[str]) -> MapState:
             for name, leaf in expected.items()
         ]
     state = jax.tree.unflatten(jax.tree.structure(template), leaves)
-    if version < 5:
-        state = state.replace(grid=_of_older_file(version, config, state.grid))
+    if version < 4:
+        state = state.replace(grid=_with_sides(config, state.grid))
     check_grid(path, config, state.grid)
     return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))
 
@@ -221,15 +221,13 @@ def _read_checked(archive: Archive, name: str) -> np.ndarray:
     return array
 
 
-def _of_older_file(version: int, config: Config, grid: Grid) -> Grid:
-    """Turns axes to be right-handed, and computes what follows from the evidence as it is now."""
-    if version < 4:
-        axes = grid.evidence.axes
-        turned = jnp.linalg.det(axes.astype(jnp.float32)) < 0
-        middle = jnp.where(turned[..., None], -axes[..., 1, :], axes[..., 1, :])
-        evidence = grid.evidence.replace(axes=axes.at[..., 1, :].set(middle))
-        grid = grid.replace(evidence=evidence)
-    return jax.jit(recompute_derived, static_argnums=0)(config, grid)
+def _with_sides(config: Config, grid: Grid) -> Grid:
+    """Turns the axes of the grid of an older file to be right-handed, and computes its sides."""
+    axes = grid.evidence.axes
+    turned = jnp.linalg.det(axes.astype(jnp.float32)) < 0
+    middle = jnp.where(turned[..., None], -axes[..., 1, :], axes[..., 1, :])
+    evidence = grid.evidence.replace(axes=axes.at[..., 1, :].set(middle))
+    return jax.jit(recompute_distances, static_argnums=0)(config, grid.replace(evidence=evidence))
 
 
 def _without_key(state: MapState) -> MapState:

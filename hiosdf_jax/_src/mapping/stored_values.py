@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 
-import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
@@ -119,13 +118,10 @@ def check_grid(path: _Path, config: Config, grid: Grid) -> None:
             raise ValueError(f"{path} has grid.surface.sdf beyond {farthest:g} m")
         if not (doubt <= _ROUNDING * config.distance_horizon).all():
             raise ValueError(f"{path} has grid.surface.doubt beyond {horizon:g} m")
-        passes, behind = (
-            jnp.asarray(counts[x], jnp.float32)
-            for counts in (grid.evidence.passes, grid.evidence.behind)
-        )
-        observed = is_observed(config, passes, jnp.asarray(hits[x], jnp.float32), behind)
-        if not ((steps >= 0) == np.asarray(observed)).all():
+        passes = np.asarray(grid.evidence.passes[x])
+        observed = is_observed(passes, hits[x])  # pyright: ignore[reportArgumentType]
+        if not ((steps >= 0) == observed).all():
             raise ValueError(
                 f"{path} has grid.surface.frontier of the wrong sign, expected one >= 0 in the "
-                "voxels that rays have observed and < 0 elsewhere"
+                "voxels that a ray has reached and < 0 elsewhere"
             )
