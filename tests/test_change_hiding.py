@@ -10,7 +10,7 @@ from voxels import CONFIG, SHAPE, empty_window, fuse_hits, rays_to, trace_rays, 
 
 from hiosdf_jax._src.change import directions, hiding
 from hiosdf_jax._src.change.novelty import Novelty
-from hiosdf_jax._src.grid.evidence import is_observed
+from hiosdf_jax._src.grid.evidence import is_reached
 
 SENSOR = np.array([-0.25, 0.52, 0.61])
 PLATE = np.array([0.18, 0.42, 0.53]), np.array([0.18, 0.63, 0.70])  # opposite corners
@@ -108,7 +108,7 @@ def test_voxels_behind_a_new_surface_are_hidden(before, hidden):
         checked += known[cell]
     assert checked > 25
     np.testing.assert_array_equal(np.asarray(result.passes)[clear], passes[clear])
-    assert not np.asarray(is_observed(result.passes, result.hits))[shadow & unmet].any()
+    assert not np.asarray(is_reached(result.passes, result.hits))[shadow & unmet].any()
     assert np.sum(clear & known) > 300
 
 

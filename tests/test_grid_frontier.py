@@ -30,7 +30,9 @@ def brute_force(inside, reach):
 
 
 def observed_voxels(state):
-    return np.asarray(is_observed(state.grid.evidence.passes, state.grid.evidence.hits))
+    seen = state.grid.evidence
+    counts = (array.astype(jnp.float32) for array in (seen.passes, seen.hits, seen.behind))
+    return np.asarray(is_observed(state.config, *counts))
 
 
 @settings(max_examples=15, deadline=None)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from interpreted import clear, interpret_point_kernels
+from interpreted import clear, interpret_point_kernels, lowered
 from voxels import (
     BOUNDS,
     CONFIG,
@@ -100,7 +100,8 @@ def patch_at(grid, cell, point):
     for axis in axes[:2]:
         half = 0.9 * 3**0.5 * axis
         offset = offset - np.clip(offset @ half / (half @ half), -1, 1) * half
-    return np.linalg.norm(offset), height
+    inside = np.clip(point - offset, np.array(cell) - 0.1, np.array(cell) + 1.1)
+    return np.linalg.norm(point - inside), height
 
 
 def space_around(derived, corners, own):
@@ -140,12 +141,17 @@ def slow_distance(grid, point_world):
             value = abs(height)
         else:
             value = max(1.5 * height, -distance) if height < 0 else height
-        limit = max(min(distance, 0.34 - 1.4 * (distance - 0.34)), -distance)
+        limit = max(min(distance, 0.4 - 1.4 * (distance - 0.4)), -distance)
         free, behind = shares[Side.FREE], shares[Side.BEHIND]
         value = free * max(value, -limit) + behind * min(value, limit) + shares["other"] * value
-        found.append((max(weight, 1e-6) * np.exp(-distance / 0.15), value))
-    weights, values = zip(*found, strict=True)
-    return 0.1 * np.dot(weights, values) / np.sum(weights)
+        found.append((max(weight, 1e-6), distance, value))
+    weights, distances, values = map(np.array, zip(*found, strict=True))
+    near = weights * np.exp(-distances / 0.14)
+    away = np.dot(near, distances) / near.sum()
+    power = np.interp(away, [0.2, 0.45], [1, 0.3])
+    even = weights * np.exp(-power * distances / 0.14)
+    size = np.dot(near, np.abs(values)) / near.sum()
+    return 0.1 * size * np.dot(even, values) / np.dot(even, np.abs(values))
 
 
 @pytest.mark.parametrize("seen", ["nothing", "room", "anything"])
@@ -282,6 +288,21 @@ def test_the_kernel_of_a_gpu_answers_as_xla_does(room, monkeypatch):
     clear()
     for value, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(value, other, atol=1e-4)
+
+
+def test_all_lookups_can_be_lowered_for_a_gpu(room, monkeypatch):
+    """Triton has fewer operations than the interpreter."""
+    surface, points = surface_of(room), jnp.asarray(uniform(5, 4096))
+    monkeypatch.setattr(devices, "has_kernels", lambda: True)
+    clear()
+    for find in (lookup.grid_sdf, lookup.doubt_distance, lookup.frontier_distance):
+
+        def value(points, find=find):
+            return find(CONFIG, surface, points)
+
+        assert "gpu.triton" in lowered(value, points)
+        assert "gpu.triton" in lowered(jax.grad(lambda points, f=value: f(points).sum()), points)
+    clear()
 
 
 def test_several_maps_of_a_gpu_are_looked_up_under_a_condition(room, monkeypatch):

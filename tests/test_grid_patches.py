@@ -1,5 +1,6 @@
 """Surface patches against moments, eigenvectors and distances in float64."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def test_principal_axes_against_numpy(seed, rank):
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10_000), st.sampled_from([(0.3, 0.2), (0.3, 0.0), (0.0, 0.0)]))
-def test_patch_offset_against_a_dense_rectangle(seed, half):
+def test_the_nearest_point_on_a_patch_against_a_dense_rectangle(seed, half):
     rng = np.random.default_rng(seed)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
     scale = 0.9 * 3**0.5
@@ -120,12 +121,43 @@ def test_patch_offset_against_a_dense_rectangle(seed, half):
     rectangle = mean + scale * (u[:, None, None] * axes[0] + u[None, :, None] * axes[1]).reshape(
         -1, 3
     )
-    nearest = np.linalg.norm(rectangle - point, axis=1).min()
-    point32, mean32, first, second = (
-        split(jnp.asarray(x, jnp.float32)) for x in (point, mean, axes[0], axes[1])
+    nearest = rectangle[np.linalg.norm(rectangle - point, axis=1).argmin()]
+    center = np.round(rng.uniform(-1, 1, 3))
+    expected = np.linalg.norm(np.clip(nearest, -0.6, 0.6) - point)
+    point32, mean32, center32, first, second = (
+        split(jnp.asarray(x, jnp.float32))
+        for x in (point + center, mean + center, center, axes[0], axes[1])
     )
-    offset = patches.patch_offset(point32, mean32, (first, second))
-    np.testing.assert_allclose(np.linalg.norm(offset), nearest, atol=1e-4)
+    on_patch = patches.nearest_on_patch(point32, mean32, (first, second), center32)
+    # The rectangle is sampled every 3 mm of a voxel of 1 m, and its nearest point moves along it.
+    np.testing.assert_allclose(np.linalg.norm(on_patch.offset), expected, atol=3e-3)
+
+
+def test_the_slope_of_the_distance_to_a_patch_against_finite_differences():
+    rng = np.random.default_rng(0)
+    count = 4000
+    rotation = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    axes = rotation * rng.uniform(0, 0.35, (count, 3, 1))
+    mean, point = rng.uniform(-0.5, 0.5, (count, 3)), rng.uniform(-2, 2, (count, 3))
+    with jax.enable_x64(True):
+        held = (split(jnp.asarray(x)) for x in (mean, axes[:, 0], axes[:, 1], 0 * mean))
+        mean64, first, second, center = held
+
+        def find(point):
+            return patches.nearest_on_patch(
+                split(jnp.asarray(point)), mean64, (first, second), center
+            )
+
+        slope = np.stack(find(point).slope, axis=-1)
+        steps = 1e-6 * np.eye(3)
+        ahead, back = (
+            np.stack([np.linalg.norm(find(point + s * step).offset, axis=0) for step in steps], -1)
+            for s in (1, -1)
+        )
+    wrong = np.abs((ahead - back) / 2e-6 - slope).max(axis=-1) > 1e-4
+    assert wrong.mean() < 1e-3  # next to a kink
+    outside = np.abs(mean[:, None] + 0.9 * 3**0.5 * axes[:, :2]).max(axis=(1, 2)) > 0.6
+    assert outside.mean() > 0.3  # some rectangles reach out of their voxels
 
 
 def test_a_vanished_wall_is_carved_and_a_new_one_counts_as_surface():

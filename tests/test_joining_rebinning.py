@@ -158,7 +158,7 @@ def test_stray_hits_that_meet_are_no_surface(stored):
 def test_a_voxel_is_seen_only_where_all_voxels_that_it_overlaps_are(stored):
     after = moved(stored, POSE)
     passes, hits = (np.asarray(x, float) for x in (stored.passes, stored.hits))
-    seen = np.asarray(evidence.is_observed(jnp.asarray(passes), jnp.asarray(hits)))
+    seen = np.asarray(evidence.is_reached(jnp.asarray(passes), jnp.asarray(hits)))
     new_passes, new_hits = (np.asarray(x, float) for x in (after.passes, after.hits))
     back = np.linalg.inv(POSE)
     line = np.linspace(-0.44, 0.44, 7)

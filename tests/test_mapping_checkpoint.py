@@ -12,6 +12,7 @@ import hiosdf_jax as hio
 from hiosdf_jax._src.change import hiding, vanishing
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid.distance import recompute_distances
+from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.mapping import stored_values
 
 
@@ -77,9 +78,9 @@ def test_load_names_what_is_wrong(room_map, tmp_path):
     with pytest.raises(ValueError, match=r"has grid\.hits of float16"):
         hio.load(path)
     for version in (1, 99):
-        other = str(arrays["header"]).replace('"version": 4', f'"version": {version}')
+        other = str(arrays["header"]).replace('"version": 5', f'"version": {version}')
         np.savez(path, **(arrays | {"header": np.asarray(other)}))
-        with pytest.raises(ValueError, match=f"format version {version}, expected 2 to 4"):
+        with pytest.raises(ValueError, match=f"format version {version}, expected 2 to 5"):
             hio.load(path)
     # Only files of older versions may lack what newer ones have added.
     for name in (*NEW_ARRAYS, "grid.surface.side"):
@@ -197,7 +198,6 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
         "grid.behind": evidence.behind,
         "grid.weight": evidence.root_weight,
         "grid.surface.mean": evidence.mean,
-        "grid.surface.frontier": derived.frontier_steps,
         "network.params.params.Dense_1.kernel": network.params["params"]["Dense_1"]["kernel"],
         "network.served.params.Dense_1.kernel": network.average["params"]["Dense_1"]["kernel"],
         "network.served.params.Dense_2.bias": network.average["params"]["Dense_2"]["bias"],
@@ -214,13 +214,17 @@ def test_a_file_of_format_version_2_still_loads(tmp_path):
     }
     for name, array in places.items():
         np.testing.assert_array_equal(array, arrays[name], err_msg=name)
-    # The axes become right-handed, and the distances of older files are computed anew.
+    # The axes become right-handed, and what follows from the evidence is computed anew.
     axes, before = np.asarray(evidence.axes, float), np.asarray(arrays["grid.surface.axes"], float)
     assert (np.linalg.det(axes) > 0).all()
     assert (axes[..., 1, :] != before[..., 1, :]).any()
     np.testing.assert_array_equal(np.abs(axes), np.abs(before))
-    recompute = jax.jit(recompute_distances, static_argnums=0)
-    assert arrays_equal(recompute(state.config, state.grid).derived, derived)
+
+    @jax.jit
+    def recompute(grid):
+        return recompute_frontier(state.config, recompute_distances(state.config, grid)).derived
+
+    assert arrays_equal(recompute(state.grid), derived)
     report = state.report
     new = (evidence.change, report.points_moving, report.refused_in_row, report.update_flags)
     for array, (shape, dtype) in zip(new, NEW_ARRAYS.values(), strict=True):
@@ -274,7 +278,7 @@ def test_a_file_of_format_version_3_keeps_its_changes(tmp_path):
 def test_names_in_a_file_do_not_change(tmp_path):
     """They are part of its format; attributes of the code may be renamed."""
     header, arrays = file_of_version_3()
-    header["version"], arrays["grid.surface.side"] = 4, np.zeros((4, 3, 2), np.int8)
+    header["version"], arrays["grid.surface.side"] = 5, np.zeros((4, 3, 2), np.int8)
     config = hio.Config(**header["config"])
     hio.save(tmp_path / "map.npz", hio.init(config, jax.random.key(0)))
     with np.load(tmp_path / "map.npz") as file:

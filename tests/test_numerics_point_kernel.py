@@ -1,13 +1,12 @@
 """Functions of points and tables: XLA, and the kernel for GPUs interpreted on a CPU."""
 
 import functools
-import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from interpreted import clear, interpret_point_kernels
+from interpreted import clear, interpret_point_kernels, lowered
 from voxels import uniform
 
 from hiosdf_jax._src.numerics import devices, point_kernel
@@ -215,20 +214,6 @@ def test_no_index_reads_beyond_a_table(monkeypatch, interpreted):
     far = points_of(COUNT).at[::2].multiply(1e6).at[::3].set(jnp.nan)
     found = jax.jit(functools.partial(by_points, looked_up, 7.0, TABLES))(far)
     assert found["mean"].shape == (COUNT,)
-
-
-def lowered(function, *arguments, platform="cuda"):
-    """The program for a GPU, made without one."""
-    if not hasattr(jax.sharding, "AbstractDevice"):
-        pytest.skip("this jax needs a GPU to make programs for one")
-    device = jax.sharding.AbstractDevice(
-        device_kind="NVIDIA H100 80GB HBM3", num_cores=132, platform="gpu"
-    )
-    mesh = jax.sharding.AbstractMesh((1,), ("x",), abstract_device=device)
-    with jax.sharding.use_abstract_mesh(mesh), warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        traced = jax.jit(function).trace(*arguments)
-        return traced.lower(lowering_platforms=(platform,)).as_text()
 
 
 def test_the_device_is_chosen_when_the_program_is_compiled(monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 from voxels import CONFIG, SHAPE, grid_of_room
 
 from hiosdf_jax._src.grid import evidence, geometry, lookup
-from hiosdf_jax._src.grid.evidence import is_observed
+from hiosdf_jax._src.grid.evidence import is_reached
 from hiosdf_jax._src.samples.from_grid import sample_grid
 from hiosdf_jax._src.state.pytrees import surface_of
 
@@ -23,7 +23,7 @@ def test_samples_are_near_and_far_and_have_the_grids_distance():
     assert (at_center[:300] < 0.05).all()
     assert (at_center[300:] >= 0.05).all()
     seen = grid.evidence
-    known = np.asarray(is_observed(seen.passes, seen.hits) | (seen.behind > 0))
+    known = np.asarray(is_reached(seen.passes, seen.hits) | (seen.behind > 0))
     assert known[tuple(np.asarray(index).T)].all()
     grid_sdf = jax.jit(lookup.grid_sdf, static_argnums=0)
     expected = grid_sdf(CONFIG, surface_of(grid), samples.points_world)
@@ -63,7 +63,7 @@ def test_a_quarter_of_the_far_samples_lies_around_what_has_changed():
     assert np.abs(offset.mean(axis=0)).max() < 0.15
     assert 0.3 < np.linalg.norm(offset, axis=1).mean() < 0.6
     index, _, inside = geometry.voxel_of(CONFIG, samples.points_world)
-    known = np.asarray(is_observed(seen.passes, seen.hits) | (seen.behind > 0))
+    known = np.asarray(is_reached(seen.passes, seen.hits) | (seen.behind > 0))
     assert np.asarray(inside).all() and known[tuple(np.asarray(index).T)].all()
     grid_sdf = jax.jit(lookup.grid_sdf, static_argnums=0)
     expected = grid_sdf(CONFIG, surface_of(grid), samples.points_world)

@@ -105,7 +105,7 @@ def time_parts(
         {
             "nearest": baselines.nearest(from_cloud, points, seconds),
             "distance": baselines.distance(*_sites(config, known, searched), seconds),
-            "frontier": baselines.frontier(_observed(known, seen_in), seconds),
+            "frontier": baselines.frontier(_observed(config, known, seen_in), seconds),
         },
     )
 
@@ -135,10 +135,10 @@ def _sites(config: Config, known: Evidence, window: Window) -> tuple[np.ndarray,
     return np.asarray(features), np.asarray(patches.is_doubtful(hits, passes))
 
 
-def _observed(known: Evidence, window: Window) -> np.ndarray:
-    """The voxels of a window that a ray has reached."""
-    passes, hits = (
-        geometry.read_window(array, window.start, window.shape)
-        for array in (known.passes, known.hits)
+def _observed(config: Config, known: Evidence, window: Window) -> np.ndarray:
+    """The observed voxels of a window."""
+    passes, hits, behind = (
+        geometry.read_window(array, window.start, window.shape).astype(jnp.float32)
+        for array in (known.passes, known.hits, known.behind)
     )
-    return np.asarray(evidence.is_observed(passes, hits))
+    return np.asarray(evidence.is_observed(config, passes, hits, behind))

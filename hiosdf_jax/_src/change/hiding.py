@@ -10,7 +10,7 @@ from hiosdf_jax._src.change.directions import View
 from hiosdf_jax._src.change.novelty import Novelty
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.grid.evidence import EvidenceWindow, is_observed
+from hiosdf_jax._src.grid.evidence import EvidenceWindow, is_reached
 from hiosdf_jax._src.grid.rays import Rays
 from hiosdf_jax._src.numerics.modes import cond
 from hiosdf_jax._src.numerics.shifts import with_neighbors
@@ -117,7 +117,7 @@ def hide_behind(
         shown = seen_past[pixel] > distance + 0.5 * size
         # Neither passed nor hit by this cloud.
         unmet = (window.passes == before.passes) & (window.hits == before.hits)
-        hidden = unmet & behind & sure & is_observed(window.passes, window.hits)
+        hidden = unmet & behind & sure & is_reached(window.passes, window.hits)
         passes = jnp.where(hidden, -jnp.maximum(window.passes, _LEAST_PASSES), window.passes)
         return jnp.where(unmet & shown & ~behind, jnp.abs(passes), passes)
 

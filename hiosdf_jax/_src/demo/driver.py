@@ -77,7 +77,7 @@ def make_driver(
 
     Args:
         robot: The robot.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         key: Source of MPPI's randomness.
         samples: Rollouts per step.

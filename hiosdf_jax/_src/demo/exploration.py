@@ -30,7 +30,7 @@ from hiosdf_jax._src.state.pytrees import Field
 
 # A body 0.4 m wide, from 0.15 m to 1.25 m above the floor.
 ROBOT = Robot(heights=(0.35, 0.49, 0.63, 0.77, 0.91, 1.05))
-_UNKNOWN = "obstacle"  # space that no ray has reached is solid
+_UNKNOWN = "obstacle"  # unseen space is solid
 _REACHED = 0.25  # m from the goal
 _CELL = 0.1  # m, of the geodesic's floor
 

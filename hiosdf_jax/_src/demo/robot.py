@@ -90,7 +90,7 @@ def clearance(robot: Robot, field: AnyField, states: jax.Array, unknown: Unknown
         robot: The robot.
         field: The map.
         states: (..., 5), or their first two components.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
 
     Returns:

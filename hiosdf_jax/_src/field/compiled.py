@@ -36,7 +36,7 @@ class CompiledQueries:
         return _lower(self.field, points_world)
 
     def observed(self, points_world: Any) -> jax.Array:
-        """A mask, (...) bool, of the points (..., 3) m that a ray has reached."""
+        """A mask, (...) bool, of the points (..., 3) m that are observed."""
         return _observed(self.field, points_world)
 
 

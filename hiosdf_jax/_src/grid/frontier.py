@@ -88,10 +88,12 @@ def recompute_frontier(config: Config, grid: Grid) -> Grid:
 def _frontier_in(config: Config, grid: Grid, window: Window) -> jax.Array:
     """Recomputes the frontier in a window that holds all that it depends on."""
     start, shape, inner_start, inner = window
-    observed = is_observed(
-        geometry.read_window(grid.evidence.passes, start, shape),
-        geometry.read_window(grid.evidence.hits, start, shape),
+    evidence = grid.evidence
+    passes, hits, behind = (
+        geometry.read_window(array, start, shape).astype(jnp.float32)
+        for array in (evidence.passes, evidence.hits, evidence.behind)
     )
+    observed = is_observed(config, passes, hits, behind)
     distance = signed_box_distance(observed, config.frontier_voxels)
     for axis in range(3):
         index = start[axis] + jax.lax.broadcasted_iota(jnp.int32, shape, axis)

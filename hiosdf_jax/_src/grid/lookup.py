@@ -32,15 +32,21 @@ from hiosdf_jax._src.state.pytrees import NO_FEATURE, Derived, Side, Surface, fr
 # A patch's weight falls by 1 / e for each of these distances that it is farther than the nearest
 # one, voxels. Twice as much rounds off corners: 0.25 instead of 0.18 cm in a small room. Half as
 # much leaves more steps where the eight voxels change.
-_SOFT_VOXELS = 0.15
+_SOFT_VOXELS = 0.14
+
+# Where signs differ, the sign is a mean of its own. Next to patches it has the weights of the
+# distance. Away from them, between these distances, voxels, it has the weights to a power that
+# falls to this one: otherwise the distance would fall steeply from one sign to the other.
+_SIGN_POWER = 0.3
+_SIGN_VOXELS = (0.2, 0.45)
 
 # The only patch around a point counts also where its trilinear weight is 0.
 _LEAST_WEIGHT = 1e-6
 
 # A patch whose sign differs from that of the space around the point counts up to the first
-# distance, voxels. From there on its distance falls by the slope, is 0 within 0.6 voxels, and ends
+# distance, voxels. From there on its distance falls by the slope, is 0 within 0.7 voxels, and ends
 # with the sign of the space.
-_OWN_SIGN_VOXELS = 0.34
+_OWN_SIGN_VOXELS = 0.4
 _OWN_SIGN_SLOPE = 1.4
 
 # Behind the plane of a patch, its height counts this many times, up to the distance. Beside the
@@ -113,17 +119,30 @@ def nearest_patch_at(
     if side_point is not None:
         around = geometry.corners_of(config, geometry.clamp(config, side_point))
     value = _signed(patch, side, _space_at(config, surface.derived, around, side, point))
+    value = jnp.where(found, value, 0)
 
-    # It cancels from the mean, and so does its derivative.
+    # It cancels from the means, and so does its derivative.
     least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)
     any_found = least < jnp.inf
     # Not by a minimum: at the nearest patch it would halve the derivative.
-    nearness = jnp.exp(jnp.where(found, least - distance, 0) / _SOFT_VOXELS)
-    weight = jnp.where(found, jnp.maximum(corners.weight, _LEAST_WEIGHT) * nearness, 0)
-    total = jnp.where(any_found, jnp.sum(weight, axis=0), 1)
-    sdf_m = jnp.sum(weight * value, axis=0) / total * config.voxel_size
-    spread_m = jnp.sum(weight * patch.spread, axis=0) / total * config.voxel_size
-    return Nearest(jnp.where(any_found, sdf_m, config.distance_horizon), spread_m)
+    lag = jnp.where(found, distance - least, 0) / _SOFT_VOXELS
+    share = jnp.where(found, jnp.maximum(corners.weight, _LEAST_WEIGHT), 0)
+    weight = share * jnp.exp(-lag)
+    weight = weight / jnp.where(any_found, jnp.sum(weight, axis=0), 1)
+    sdf = jnp.sum(weight * value, axis=0)
+
+    fixed = jax.lax.stop_gradient(value)
+    differ = (jnp.max(fixed, axis=0) > 0) & (jnp.min(fixed, axis=0) < 0)
+    size = jnp.abs(value)
+    start, end = _SIGN_VOXELS
+    away = jnp.clip((jnp.sum(weight * distance, axis=0) - start) / (end - start), 0, 1)
+    share = share * jnp.exp(-(1 + away * (_SIGN_POWER - 1)) * lag)
+    total = jnp.sum(share * size, axis=0)
+    sign = jnp.sum(share * value, axis=0) / jnp.where(differ & (total > 0), total, 1)
+    sdf = jnp.where(differ, sign * jnp.sum(weight * size, axis=0), sdf)
+    spread = jnp.sum(weight * patch.spread, axis=0)
+    sdf_m = jnp.where(any_found, sdf * config.voxel_size, config.distance_horizon)
+    return Nearest(sdf_m, spread * config.voxel_size)
 
 
 class MeanPlane(NamedTuple):
@@ -274,19 +293,18 @@ def _patches_at(
     row = geometry.flat_index(config.grid_shape, sites)
     found, sites, row = compute_once((found, sites, row))
     means, axes = surface.mean.reshape(-1, 3), surface.axes.reshape(-1, 9)
-    mean = each(lambda m, s, f: m + (s - f), take(means, row), sites, first)
-    mean = compute_once(mean)
+    center = each(lambda s, f: (s - f).astype(jnp.float32), sites, first)
+    mean, center = compute_once((each(jnp.add, take(means, row), center), center))
     fixed = jax.lax.stop_gradient(point)
-    offset = patches.patch_offset(fixed, mean, (take(axes, row), take(axes, row, 3)))
+    spans = take(axes, row), take(axes, row, 3)
+    offset, slope = patches.nearest_on_patch(fixed, mean, spans, center)
     away = jnp.where(found, length(offset), 0)
     spread = length(take(axes, row, 6))
     across = cross(take(axes, row), take(axes, row, 3))
     normal = unit(across)
     # Linear in the point, with the exact value and slope: reverse mode need not go back through the
     # nearest points of eight patches.
-    step = each(jnp.subtract, point, fixed)
-    direction = each(lambda o: o / jnp.maximum(away, 1e-9), offset)
-    distance = away + dot(direction, step)
+    distance = away + dot(slope, each(jnp.subtract, point, fixed))
     above = each(jnp.subtract, point, mean)
     height = dot(above, normal)
     distance = jnp.where(found, distance, 0)

@@ -15,6 +15,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
 from hiosdf_jax._src.grid.distance import recompute_distances
+from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.mapping.lifecycle import init
 from hiosdf_jax._src.mapping.stored_values import check_array, check_grid
 from hiosdf_jax._src.numerics.intake import is_traced
@@ -23,7 +24,7 @@ from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.pytrees import Grid, MapState
 
 _FORMAT = "hiosdf_jax map"
-_VERSION = 4
+_VERSION = 5
 
 # Names in the file are part of its format; attributes of the code may be renamed.
 _FILE_NAMES = {
@@ -170,8 +171,8 @@ def load(path: str | os.PathLike[str]) -> MapState:
             for name, leaf in expected.items()
         ]
     state = jax.tree.unflatten(jax.tree.structure(template), leaves)
-    if version < 4:
-        state = state.replace(grid=_with_sides(config, state.grid))
+    if version < 5:
+        state = state.replace(grid=_of_older_file(version, config, state.grid))
     check_grid(path, config, state.grid)
     return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))
 
@@ -221,13 +222,20 @@ def _read_checked(archive: Archive, name: str) -> np.ndarray:
     return array
 
 
-def _with_sides(config: Config, grid: Grid) -> Grid:
-    """Turns the axes of the grid of an older file to be right-handed, and computes its sides."""
-    axes = grid.evidence.axes
-    turned = jnp.linalg.det(axes.astype(jnp.float32)) < 0
-    middle = jnp.where(turned[..., None], -axes[..., 1, :], axes[..., 1, :])
-    evidence = grid.evidence.replace(axes=axes.at[..., 1, :].set(middle))
-    return jax.jit(recompute_distances, static_argnums=0)(config, grid.replace(evidence=evidence))
+def _of_older_file(version: int, config: Config, grid: Grid) -> Grid:
+    """Turns axes to be right-handed, and computes what follows from the evidence as it is now."""
+    if version < 4:
+        axes = grid.evidence.axes
+        turned = jnp.linalg.det(axes.astype(jnp.float32)) < 0
+        middle = jnp.where(turned[..., None], -axes[..., 1, :], axes[..., 1, :])
+        evidence = grid.evidence.replace(axes=axes.at[..., 1, :].set(middle))
+        grid = grid.replace(evidence=evidence)
+    return _recompute_derived(config, grid)
+
+
+@jax.jit(static_argnums=0)
+def _recompute_derived(config: Config, grid: Grid) -> Grid:
+    return recompute_frontier(config, recompute_distances(config, grid))
 
 
 def _without_key(state: MapState) -> MapState:

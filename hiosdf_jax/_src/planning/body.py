@@ -41,7 +41,7 @@ def clearance_and_jacobian(
         spheres: The body at a configuration, a pure function of JAX arrays; the radii do not
             depend on the configuration.
         q: (n,) m or rad. Use vmap for many configurations.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.

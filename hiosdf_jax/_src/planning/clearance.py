@@ -35,7 +35,7 @@ def sphere_clearance(
         field: A map, a snapshot of one, or a baked snapshot.
         centers_world: (..., 3) m.
         radii: m, >= 0; any shape that broadcasts to that of the spheres, (...).
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.
@@ -64,7 +64,7 @@ def sphere_clearance_and_grad(
         field: A map, a snapshot of one, or a baked snapshot.
         centers_world: (..., 3) m.
         radii: As for `sphere_clearance`.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.

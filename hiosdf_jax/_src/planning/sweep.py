@@ -57,7 +57,7 @@ def swept_clearance(
         end_world: (..., 3) m, where they move along straight lines. A robot's joints move them
             along arcs: divide a motion until arc and chord differ by less than your margin.
         radii: m, >= 0; any shape that broadcasts to that of the spheres, (...).
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.
@@ -103,7 +103,7 @@ def swept_clearance_and_grad(
         start_world: (..., 3) m, centers of the spheres.
         end_world: (..., 3) m, where they move along straight lines.
         radii: As for `swept_clearance`.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         slope: As for `swept_clearance`.
         evaluations: As for `swept_clearance`.

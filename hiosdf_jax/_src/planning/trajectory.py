@@ -122,7 +122,7 @@ def optimize_trajectory(
         margin_m: Clearance to aim for; a soft constraint.
         steps: Steps of Adam.
         step_m: Adam's learning rate, about the most that a waypoint moves per step. It decays.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.

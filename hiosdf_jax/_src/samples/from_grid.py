@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from hiosdf_jax._src.change.vanishing import is_recent
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
-from hiosdf_jax._src.grid.evidence import is_observed
+from hiosdf_jax._src.grid.evidence import is_reached
 from hiosdf_jax._src.numerics.tiles import map_tiles
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.samples.draw import Samples, draw_from_masks, draw_words, normal, uniform
@@ -41,7 +41,7 @@ def sample_grid(config: Config, grid: Grid, key: jax.Array) -> Samples:
         near_samples + far_samples samples, with weight 0 where there is no such voxel.
     """
     evidence, derived = grid.evidence, grid.derived
-    known = (is_observed(evidence.passes, evidence.hits) | (evidence.behind > 0)) & (
+    known = (is_reached(evidence.passes, evidence.hits) | (evidence.behind > 0)) & (
         derived.nearest[..., 0] != NO_FEATURE
     )
     near = known & (jnp.abs(derived.sdf) < config.near_distance)

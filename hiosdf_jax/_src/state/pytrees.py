@@ -128,7 +128,7 @@ class Derived(Described):
         doubt: Distance of the voxel's center to the nearest voxel in which any ray has ended and
             that is not almost certainly free, m, (X, Y, Z) float16. Carved surfaces and surfaces
             that were hit once count.
-        frontier_steps: Distance of the voxel's center to the nearest voxel that no ray has reached,
+        frontier_steps: Distance of the voxel's center to the nearest voxel that is not observed,
             in steps of 1 / 127 of the frontier horizon; in unobserved voxels, minus the distance to
             the nearest observed one, (X, Y, Z) int8.
     """
@@ -289,8 +289,9 @@ class Query(NamedTuple):
     Attributes:
         sdf: Signed distance under the chosen policy for unseen space, (...) float32, m.
         grad: d(sdf)/d(point), (..., 3) float32.
-        observed: Whether a ray has reached the voxel that contains the point, (...) bool.
-        frontier: Distance to the nearest voxel that no ray has reached, (...) float32, m; not
+        observed: Whether rays have shown the voxel that contains the point to be free or to hold a
+            surface, (...) bool.
+        frontier: Distance to the nearest voxel that is not observed, (...) float32, m; not
             positive in such voxels.
         lower: At most the true distance at about 99 % of the points on a sensor's rays, (...)
             float32, m. It is calibrated on each new cloud, not guaranteed. It is negative in unseen

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 UNSEEN = (150, 150, 150)
-"""Color of space that no ray has reached, 0..255."""
+"""Color of unseen space, 0..255."""
 
 _BAR_INCHES = (3.2, 0.62)  # of one bar, with its label and numbers
 _DPI = 150

@@ -190,7 +190,7 @@ def cut(queries: CompiledQueries, axis: int, at_m: float) -> SlicePlane:
 
 
 def edge_of_unseen(field: Field) -> tuple[np.ndarray, np.ndarray]:
-    """Finds where free space ends at space that no ray has reached.
+    """Finds where free space ends at unseen space.
 
     Args:
         field: A snapshot of a map.

@@ -43,7 +43,7 @@ class Look:
         at_m: Where the slice is along that axis, m, world frame.
         surface: Show the surface.
         slice: Show the slice.
-        unseen: Show where free space ends at space that no ray has reached.
+        unseen: Show where free space ends at unseen space.
         cloud: Show the newest cloud.
         sensor: Show the sensor and its path.
     """

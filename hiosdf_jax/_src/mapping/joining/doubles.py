@@ -91,7 +91,8 @@ def _lies_on(window: EvidenceWindow, other: EvidenceWindow, surface: jax.Array) 
         weight = near[0]
         mean, long, middle, facing = ((near[i], near[i + 1], near[i + 2]) for i in (1, 4, 7, 10))
         point = each(lambda c, s: c - s.astype(jnp.float32), center, step)
-        apart = patches.patch_offset(point, mean, (long, middle))
+        own = each(jnp.zeros_like, mean)
+        apart = patches.nearest_on_patch(point, mean, (long, middle), own).offset
         on = (length(apart) < _MOST_VOXELS) & (dot(normal, facing) > 0)
         return found | (on & (weight > window.weight))
 

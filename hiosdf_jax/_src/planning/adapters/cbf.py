@@ -53,7 +53,7 @@ def velocity_filter(
             while a command is held, and the map's error.
         gain_per_s: The clearance beyond the margin shrinks by at most this fraction per second.
             Keep it well below 1 / dt for commands held for dt.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.

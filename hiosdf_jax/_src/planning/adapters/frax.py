@@ -73,7 +73,7 @@ def arm_clearance(
         arm: As for `arm_spheres`.
         q: (..., n) joint positions, rad or m.
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.
@@ -103,7 +103,7 @@ def arm_clearance_and_grad(
         arm: As for `arm_spheres`.
         q: (..., n) joint positions, rad or m.
         pose_world_base: (4, 4) T_world_base, m; the identity if None.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.

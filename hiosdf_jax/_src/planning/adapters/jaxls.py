@@ -61,7 +61,7 @@ def clearance_constraint(
         spheres: The body at a variable's value, a pure function of JAX arrays. The radii do not
             depend on the value.
         margin_m: Clearance to keep, m, >= 0.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.
@@ -104,7 +104,7 @@ def clearance_cost(
         spheres: As for `clearance_constraint`.
         margin_m: Clearance from which there is no cost, m, > 0.
         weight: Per m, > 0.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.

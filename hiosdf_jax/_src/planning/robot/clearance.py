@@ -37,7 +37,7 @@ def robot_clearance(
         field: A map, a snapshot of one, or a baked snapshot.
         spheres: The robot's spheres.
         data: As for `place_spheres`.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: "sdf" keeps clear of the estimated surfaces, "lower" of the calibrated lower bound
             of the distance; see `hiosdf_jax.query`.
@@ -79,7 +79,7 @@ def robot_clearance_and_grad(
         field: A map, a snapshot of one, or a baked snapshot.
         spheres: The robot's spheres.
         data: As for `place_spheres`.
-        unknown: Policy for space that no ray has reached: "obstacle" takes it as solid, "network"
+        unknown: Policy for unseen space: "obstacle" takes it as solid, "network"
             uses the map's prediction.
         bound: As for `robot_clearance`.
 
