@@ -175,8 +175,14 @@ def test_correct_puts_submaps_where_they_belong(halves, merged):
     submaps = [halves[0], hio.transform(halves[1], off)]
     fixed = hio.correct(submaps, np.stack([np.eye(4), np.linalg.inv(off)]))
     assert int(fixed.updates) == 24
-    assert error_cm(fixed) < 1.1 * error_cm(merged) + 0.1
-    assert error_cm(fixed) < 0.8 * error_cm(hio.correct(submaps, np.stack([np.eye(4)] * 2)))
+    wrong = hio.correct(submaps, np.stack([np.eye(4)] * 2))
+    # At 2,000 points the ratio of two errors is uncertain by several percent.
+    many = np.random.default_rng(1).uniform(-0.5, 0.5, (10, 2000, 3)).astype(np.float32)
+    good, bad, best = (
+        np.mean([error_cm(state, points) for points in many]) for state in (fixed, wrong, merged)
+    )
+    assert good < 1.1 * best + 0.1
+    assert good < 0.8 * bad
 
 
 def test_inside_jit_a_bad_pose_is_flagged_and_adds_nothing(room_map, empty_map):
