@@ -36,12 +36,12 @@ _LEAST_SCALE_VOXELS = 0.3
 _GAP_SHARE = 0.5
 
 # An unseen surface is assumed at most this much nearer than any observed one: with more, the mean
-# bound falls faster than the errors. Within 2.5 voxels of unseen space the assumption grows, since
-# the nearest surface may well lie in it. On half of house_depth, the bound then holds for 99.4
-# instead of 98.8 % of the points.
-_HIDDEN_VOXELS = 0.3
+# bound falls faster than the errors. Within 2 voxels of unseen space the assumption grows, since
+# the nearest surface may well lie in it. On house_depth, the bound then holds for 99.87 instead of
+# 99.80 % of the points and is 0.05 cm lower; on house_lidar for 99.56 instead of 99.51 %.
+_HIDDEN_VOXELS = 0.2
 _HIDDEN_BESIDE_VOXELS = 0.8
-_BESIDE_VOXELS = 2.5
+_BESIDE_VOXELS = 2.0
 
 
 def bounds(field: Field) -> Bounds:
@@ -64,8 +64,7 @@ def sdf(field: Field, points_world: jax.Array, unknown: Unknown) -> jax.Array:
     network = network_sdf(field, points_world)
     if config.grid_share == 0:
         return network
-    grid = lookup.grid_sdf(config, field.surface, points_world)
-    unseen = frontier(field, points_world)
+    grid, unseen = lookup.distances(config, field.surface, points_world)
     grid, network, unseen = map(compute_once, (grid, network, unseen))
     return _combine(config, grid, network, unseen, unknown)
 
