@@ -110,6 +110,28 @@ def test_a_voxel_is_reached_unless_it_is_hidden_or_no_ray_has_met_it():
     np.testing.assert_array_equal(evidence.is_reached(passes, hits), expected)
 
 
+@pytest.mark.parametrize(
+    ("passes", "hits", "behind", "expected"),
+    [
+        (0, 0, 0, False),  # no ray
+        (0, 0, 5, False),  # behind a surface
+        (1, 0, 0, True),  # free
+        (1, 0, 10, True),
+        (1, 0, 11, False),  # noise behind a surface
+        (-5, 20, 0, False),  # hidden by a new surface
+        (0, 1, 0, False),  # one return is no surface
+        (0, 2, 0, True),
+        (0, 2, 20, True),
+        (0, 2, 21, False),  # noise behind a surface
+        (2, 2, 100, False),
+    ],
+)
+def test_a_voxel_is_observed_if_it_is_free_or_holds_a_surface(passes, hits, behind, expected):
+    counts = (jnp.float32(count) for count in (passes, hits, behind))
+    config = dataclasses.replace(CONFIG, min_hits=2)
+    assert bool(evidence.is_observed(config, *counts)) == expected
+
+
 def test_hidden_voxels_and_changes_are_stored():
     rng = np.random.default_rng(5)
     passes, change = rng.integers(-9, 10, SHAPE), rng.integers(-72, 9, SHAPE)

@@ -10,6 +10,7 @@ from room import BOUNDS, CONFIG
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.grid import frontier, geometry
+from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.numerics import loops
 
 signed_box_distance = jax.jit(frontier.signed_box_distance, static_argnums=1)
@@ -29,10 +30,9 @@ def brute_force(inside, reach):
 
 
 def observed_voxels(state):
-    """Those that rays have reached, and that do not lie behind a surface."""
     seen = state.grid.evidence
-    passes, hits, side = map(np.asarray, (seen.passes, seen.hits, state.grid.derived.side))
-    return (passes >= 0) & ((passes > 0) | (hits > 0)) & (side != -1)
+    counts = (array.astype(jnp.float32) for array in (seen.passes, seen.hits, seen.behind))
+    return np.asarray(is_observed(state.config, *counts))
 
 
 @settings(max_examples=15, deadline=None)

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from room import arrays_equal
@@ -21,8 +19,6 @@ from voxels import (
 )
 
 from hiosdf_jax._src.grid import evidence, windows
-from hiosdf_jax._src.grid.distance import recompute_distances
-from hiosdf_jax._src.grid.frontier import recompute_frontier
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 
 
@@ -94,52 +90,3 @@ def test_the_small_window_is_for_rays_that_reach_half_the_range_along_no_axis():
             assert (3 + box.high_world + reach <= 0.1 * (first + size) + 1e-6).all()
             assert (np.array(window.within) >= 3).all()
             assert (np.add(window.within, size) + 3 <= window.shape).all()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_frontier_follows_sides_that_change_beyond_the_evidence(seed):
-    """Sparse hits, and hidden voxels around them: a side depends on hits that are far away."""
-    config = dataclasses.replace(
-        CONFIG,
-        bounds=((0.0, 0.0, 0.0), (4.0, 2.0, 1.0)),
-        max_range=0.38,
-        distance_horizon=0.9,
-        frontier_horizon=0.3,
-    )
-    rng, shape = np.random.default_rng(seed), config.grid_shape
-    sensor = np.array([2.09, 1.09, 0.59])
-
-    def scattered(count, share):
-        return (count * (rng.random((2, *shape)) < share)).astype(np.float32)
-
-    # Few passes do not free a voxel where many rays end before it.
-    hits, passes, behind = scattered(19, 0.0002), scattered(1, 1), scattered(90, 0.1)
-    center = 0.1 * (np.moveaxis(np.indices(shape), 0, -1) + 0.5)
-    gap = np.abs(center - sensor).max(axis=-1) / 0.1
-    mean = rng.uniform(-0.45, 0.45, (*shape, 3)).astype(np.float32)
-    ends = np.abs(center + 0.1 * mean - sensor).max(axis=-1) < 0.19
-    hits[1] = np.where(ends, 19 * (rng.random(shape) < 0.5), hits[0])
-    for counts in (passes, behind):
-        counts[1] = np.where(gap < 1.9 + HIDDEN_VOXELS, counts[1], counts[0])
-    axes = 0.25 * np.eye(3) * [[1], [1], [0.1]]
-    box = windows.RayBox(sensor, sensor - 0.19, sensor + 0.19)
-    derived = evidence.empty_grid(config).derived
-
-    def grid_with(k):
-        window = empty_window(config)._replace(
-            hits=jnp.asarray(hits[k]), passes=jnp.asarray(passes[k]), behind=jnp.asarray(behind[k])
-        )
-        shapes = jnp.broadcast_to(jnp.float32(axes), (*shape, 3, 3))
-        window = window._replace(mean=jnp.asarray(mean), axes=shapes)
-        return grid_of(window, derived)
-
-    @jax.jit
-    def recompute(grid):
-        return recompute_frontier(config, recompute_distances(config, grid))
-
-    before, after = recompute(grid_with(0)), recompute(grid_with(1))
-    grid = grid_with(1).replace(derived=before.derived)
-    grid = update_frontier(config, update_distances(config, grid, box), box)
-    assert arrays_equal(grid.derived, after.derived)
-    changed = np.asarray(before.derived.side != after.derived.side)
-    assert changed[gap > 1.9 + HIDDEN_VOXELS].any()

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from voxels import CONFIG, SHAPE, empty_window
 
-from hiosdf_jax._src.grid import distance, patches
+from hiosdf_jax._src.grid import evidence, patches
 from hiosdf_jax._src.mapping.joining import adding, doubles
 
 is_surface = jax.jit(doubles.is_surface, static_argnums=0)
@@ -148,7 +148,7 @@ def test_a_dropped_patch_leaves_no_free_voxel_where_no_ray_passed():
     thin = window_of([(5, 5, 3)], (0, 0, 0.3), flat(), hits=3.0, passes=0.0)
     after = drop_doubles(CONFIG, wall, thin)[1]
     assert after.hits[5, 5, 3] == 0 and after.passes[5, 5, 3] > 0
-    assert not distance.is_free(after.passes, after.behind)[5, 5, 3]
+    assert not evidence.is_free(after.passes, after.behind)[5, 5, 3]
 
 
 def test_what_a_patch_was_dropped_for_stays_in_the_sum():

@@ -15,17 +15,11 @@ from benchmarks.speed import baselines, limits
 from benchmarks.speed.rows import Measured, time_ms
 from benchmarks.speed.setup import Frame
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid import frontier, geometry, patches
-from hiosdf_jax._src.grid.windows import (
-    SIDE_REACH_VOXELS,
-    RayBox,
-    Window,
-    box_of_rays,
-    place_windows,
-)
+from hiosdf_jax._src.grid import evidence, geometry, patches
+from hiosdf_jax._src.grid.windows import RayBox, Window, box_of_rays, place_windows
 from hiosdf_jax._src.mapping import pipeline
 from hiosdf_jax._src.mapping.stages import STAGES, Step, begin
-from hiosdf_jax._src.state.pytrees import Evidence, Grid, MapState
+from hiosdf_jax._src.state.pytrees import Evidence, MapState
 
 _COMPARE = {
     "update_distances": "distance",
@@ -93,7 +87,7 @@ def time_parts(
     config, known = step.config, step.state.grid.evidence
     box = box_of_rays(step.rays)
     searched = _searched(config, box, config.horizon_voxels)
-    seen_in = _searched(config, box, config.frontier_voxels, SIDE_REACH_VOXELS)
+    seen_in = _searched(config, box, config.frontier_voxels)
     work = {
         "update_distances": limits.distance_work(config, searched),
         "train": limits.training_work(config),
@@ -111,7 +105,7 @@ def time_parts(
         {
             "nearest": baselines.nearest(from_cloud, points, seconds),
             "distance": baselines.distance(*_sites(config, known, searched), seconds),
-            "frontier": baselines.frontier(_observed(step.state.grid, seen_in), seconds),
+            "frontier": baselines.frontier(_observed(config, known, seen_in), seconds),
         },
     )
 
@@ -124,12 +118,9 @@ def _changes(stage: Callable[[Step], Step], step: Step) -> Step:
     )
 
 
-def _searched(
-    config: Config, box: RayBox, horizon_voxels: int, beyond_voxels: float = 0.0
-) -> Window:
+def _searched(config: Config, box: RayBox, horizon_voxels: int) -> Window:
     """The window in which a stage recomputes its distances."""
-    horizon_m, beyond_m = (n * config.voxel_size for n in (horizon_voxels, beyond_voxels))
-    small, large, fits = place_windows(config, box, horizon_m, beyond_m)
+    small, large, fits = place_windows(config, box, horizon_voxels * config.voxel_size)
     return small if fits else large
 
 
@@ -144,10 +135,10 @@ def _sites(config: Config, known: Evidence, window: Window) -> tuple[np.ndarray,
     return np.asarray(features), np.asarray(patches.is_doubtful(hits, passes))
 
 
-def _observed(grid: Grid, window: Window) -> np.ndarray:
+def _observed(config: Config, known: Evidence, window: Window) -> np.ndarray:
     """The observed voxels of a window."""
-    passes, hits, side = (
-        geometry.read_window(array, window.start, window.shape)
-        for array in (grid.evidence.passes, grid.evidence.hits, grid.derived.side)
+    passes, hits, behind = (
+        geometry.read_window(array, window.start, window.shape).astype(jnp.float32)
+        for array in (known.passes, known.hits, known.behind)
     )
-    return np.asarray(frontier.is_observed(passes, hits, side))
+    return np.asarray(evidence.is_observed(config, passes, hits, behind))

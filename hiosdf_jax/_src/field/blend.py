@@ -37,10 +37,10 @@ _GAP_SHARE = 0.5
 
 # An unseen surface is assumed at most this much nearer than any observed one: with more, the mean
 # bound falls faster than the errors. Within 2.5 voxels of unseen space the assumption grows, since
-# the nearest surface may well lie in it. On house_depth, the bound then holds for 97.4 instead of
-# 95.7 % of the points after 6 frames.
-_HIDDEN_VOXELS = 0.2
-_HIDDEN_BESIDE_VOXELS = 1.0
+# the nearest surface may well lie in it. On half of house_depth, the bound then holds for 99.4
+# instead of 98.8 % of the points.
+_HIDDEN_VOXELS = 0.3
+_HIDDEN_BESIDE_VOXELS = 0.8
 _BESIDE_VOXELS = 2.5
 
 
@@ -64,7 +64,9 @@ def sdf(field: Field, points_world: jax.Array, unknown: Unknown) -> jax.Array:
     network = network_sdf(field, points_world)
     if config.grid_share == 0:
         return network
-    grid, unseen = lookup.distances(config, field.surface, points_world)
+    # Two kernels on a GPU: one for both takes a fifth longer on an H200.
+    grid = lookup.grid_sdf(config, field.surface, points_world)
+    unseen = frontier(field, points_world)
     grid, network, unseen = map(compute_once, (grid, network, unseen))
     return _combine(config, grid, network, unseen, unknown)
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
+from hiosdf_jax._src.grid.evidence import FREE_RATIO, is_free
 from hiosdf_jax._src.grid.nearest import Part, nearest_sites
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
@@ -14,13 +15,9 @@ from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
 from hiosdf_jax._src.state.pytrees import NO_FEATURE, Derived, Grid, Side
 
-# A voxel is free with at least this many passes per ray that ended just before it: noise puts some
-# ends of rays too far away.
-_FREE_RATIO = 0.1
-
-# Fewer passes suffice far from patches: noise does not put ends of rays there. The share falls to
-# this one between these distances of the voxel's center from the nearest patch, voxels. In the
-# apartment it frees about 150 voxels, 3 of which are solid.
+# Fewer passes suffice far from patches: noise does not put ends of rays there. The share falls from
+# `FREE_RATIO` to this one between these distances of the voxel's center from the nearest patch,
+# voxels. In the apartment it frees about 150 voxels, 3 of which are solid.
 _FAR_FREE_RATIO = 0.02
 _FAR_VOXELS = (1.0, 1.5)
 
@@ -150,22 +147,6 @@ def _compute_together(sdf: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.A
     return sdf, jax.lax.bitcast_convert_type((both >> 16).astype(jnp.uint8), side.dtype)
 
 
-def is_free(
-    passes: jax.Array, behind: jax.Array, ratio: jax.Array | float = _FREE_RATIO
-) -> jax.Array:
-    """Returns a mask of the voxels that rays have shown to be free.
-
-    Args:
-        passes: Rays that went through the voxel, (...).
-        behind: Rays that ended a little before it, (...).
-        ratio: Least passes per ray that ended before the voxel, (...).
-
-    Returns:
-        (...) bool.
-    """
-    return (passes > 0) & (passes >= ratio * behind)
-
-
 def _side(
     passes: jax.Array,
     behind: jax.Array,
@@ -213,7 +194,7 @@ def _side(
     by_rays = jnp.where((behind[own] > 0) & marked, -1.0, unobserved)
     start, end = _FAR_VOXELS
     far = jnp.clip((distance - start) / (end - start), 0, 1)
-    ratio = _FREE_RATIO + far * (_FAR_FREE_RATIO - _FREE_RATIO)
+    ratio = FREE_RATIO + far * (_FAR_FREE_RATIO - FREE_RATIO)
     by_rays = jnp.where(is_free(passes[own], behind[own], ratio), 1.0, by_rays)
     blocked = (passes[own] <= 0) & (behind[own] >= _BLOCKED_RAYS) & (distance > _BLOCKED_VOXELS)
     trusted = flat & sure & (distance < 1) & ~blocked

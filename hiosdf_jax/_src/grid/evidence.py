@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
@@ -17,6 +18,10 @@ _STORED = jnp.float16
 
 # Rounding to float16 multiplies a number by at most 1 + 2^-11 = 1.0005.
 _ROUNDING = 1.0007
+
+# A voxel is free with at least this many passes per ray that ended just before it, and holds a
+# surface with at least this many hits: noise puts some ends of rays too far away.
+FREE_RATIO = 0.1
 
 
 class EvidenceWindow(NamedTuple):
@@ -173,6 +178,39 @@ def is_reached(passes: jax.Array, hits: jax.Array) -> jax.Array:
         (...) bool.
     """
     return (passes > 0) | ((hits > 0) & (passes >= 0))
+
+
+def is_free[A: (jax.Array, np.ndarray)](passes: A, behind: A, ratio: A | float = FREE_RATIO) -> A:
+    """Returns a mask of the voxels that rays have shown to be free.
+
+    Args:
+        passes: Rays that went through the voxel, (...).
+        behind: Rays that ended a little before it, (...).
+        ratio: Least passes per ray that ended before the voxel, (...).
+
+    Returns:
+        (...) bool.
+    """
+    return (passes > 0) & (passes >= ratio * behind)
+
+
+def is_observed[A: (jax.Array, np.ndarray)](config: Config, passes: A, hits: A, behind: A) -> A:
+    """Returns a mask of the voxels that rays have shown to be free or to hold a surface.
+
+    A few rays reach the voxels behind a surface, through noise or past an edge. They do not show
+    on which side of the surface such a voxel lies.
+
+    Args:
+        config: The map's configuration.
+        passes: Rays that went through the voxel, (...); negative where it is hidden again.
+        hits: Rays that ended in it, (...).
+        behind: Rays that ended a little before it, (...).
+
+    Returns:
+        (...) bool.
+    """
+    surface = (hits >= config.min_hits) & (hits >= FREE_RATIO * behind)
+    return (passes >= 0) & (is_free(passes, behind) | surface)
 
 
 def rounded(values: jax.Array) -> jax.Array:

@@ -8,37 +8,14 @@ import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.grid.evidence import is_reached
-from hiosdf_jax._src.grid.windows import (
-    SIDE_REACH_VOXELS,
-    RayBox,
-    Window,
-    recompute,
-    whole_grid,
-)
+from hiosdf_jax._src.grid.evidence import is_observed
+from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
-from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, Grid, Side, frontier_step_m
+from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, Grid, frontier_step_m
 
 _INFINITE = 1e12  # squared voxels
-
-
-def is_observed(passes: jax.Array, hits: jax.Array, side: jax.Array) -> jax.Array:
-    """Returns a mask of the voxels that rays have reached and that do not lie behind a surface.
-
-    A few rays reach voxels behind a surface, through noise or past an edge. What is there remains
-    unseen.
-
-    Args:
-        passes: As in `Evidence`, (...).
-        hits: As in `Evidence`, (...).
-        side: As in `Derived`, (...).
-
-    Returns:
-        (...) bool.
-    """
-    return is_reached(passes, hits) & (side != Side.BEHIND)
 
 
 def signed_box_distance(inside: jax.Array, reach: int) -> jax.Array:
@@ -86,7 +63,7 @@ def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:
 
     Args:
         config: The map's configuration.
-        grid: The grid, with new evidence and its distances.
+        grid: The grid, with new evidence.
         box: The rays of the new evidence.
 
     Returns:
@@ -94,12 +71,11 @@ def update_frontier(config: Config, grid: Grid, box: RayBox) -> Grid:
         unseen.
     """
     horizon_m = config.frontier_voxels * config.voxel_size
-    side_reach_m = SIDE_REACH_VOXELS * config.voxel_size
 
     def inside(window: Window) -> jax.Array:
         return _frontier_in(config, grid, window)
 
-    steps = recompute(config, box, horizon_m, inside, side_reach_m)
+    steps = recompute(config, box, horizon_m, inside)
     return grid.replace(derived=grid.derived.replace(frontier_steps=steps))
 
 
@@ -112,11 +88,12 @@ def recompute_frontier(config: Config, grid: Grid) -> Grid:
 def _frontier_in(config: Config, grid: Grid, window: Window) -> jax.Array:
     """Recomputes the frontier in a window that holds all that it depends on."""
     start, shape, inner_start, inner = window
-    passes, hits, side = (
-        geometry.read_window(array, start, shape)
-        for array in (grid.evidence.passes, grid.evidence.hits, grid.derived.side)
+    evidence = grid.evidence
+    passes, hits, behind = (
+        geometry.read_window(array, start, shape).astype(jnp.float32)
+        for array in (evidence.passes, evidence.hits, evidence.behind)
     )
-    observed = is_observed(passes, hits, side)
+    observed = is_observed(config, passes, hits, behind)
     distance = signed_box_distance(observed, config.frontier_voxels)
     for axis in range(3):
         index = start[axis] + jax.lax.broadcasted_iota(jnp.int32, shape, axis)

@@ -425,36 +425,6 @@ def _doubt_at(config: Config, surface: Surface, point: Vector) -> jax.Array:
     return jnp.sum(around * corners.weight, axis=0)
 
 
-class Distances(NamedTuple):
-    """Distances to patches and to unseen space.
-
-    Attributes:
-        sdf: As of `grid_sdf`, (...) m.
-        frontier: As of `frontier_distance`, (...) m.
-    """
-
-    sdf: jax.Array
-    frontier: jax.Array
-
-
-def distances(config: Config, surface: Surface, points_world: jax.Array) -> Distances:
-    """Computes `grid_sdf` and `frontier_distance` together, in one kernel on a GPU.
-
-    Args:
-        config: The map's configuration.
-        surface: The grid's surface.
-        points_world: (..., 3) m, inside the bounds.
-
-    Returns:
-        Both distances. Differentiable.
-    """
-    return by_points(_distances_at, config, surface, points_world)
-
-
-def _distances_at(config: Config, surface: Surface, point: Vector) -> Distances:
-    return Distances(_grid_sdf_at(config, surface, point), frontier_at(config, surface, point))
-
-
 def frontier_distance(config: Config, surface: Surface, points_world: jax.Array) -> jax.Array:
     """Computes the distance to the nearest unobserved voxel, interpolated between voxel centers.
 

@@ -20,11 +20,6 @@ from hiosdf_jax._src.numerics.modes import cond
 _SMALL = 0.5
 
 
-# A cloud can change the sides of voxels this much farther away than the evidence that it changes:
-# sides depend on hits up to 6 voxels away, and hits lie 4 voxels before what they hide.
-SIDE_REACH_VOXELS = 2
-
-
 class RayBox(NamedTuple):
     """The axis-aligned box of a cloud's rays.
 
@@ -70,7 +65,7 @@ class Window(NamedTuple):
 
 
 def place_windows(
-    config: Config, box: RayBox, horizon_m: float, beyond_m: float = 0.0
+    config: Config, box: RayBox, horizon_m: float
 ) -> tuple[Window, Window, jax.Array]:
     """Places the windows in which a quantity of a given horizon is recomputed.
 
@@ -81,8 +76,6 @@ def place_windows(
         config: The map's configuration.
         box: The cloud's rays.
         horizon_m: The horizon, m, a static number.
-        beyond_m: How far from new evidence that on which the quantity depends can have changed, m,
-            a static number.
 
     Returns:
         small: Window around the box of the rays.
@@ -92,7 +85,7 @@ def place_windows(
     hidden_m = HIDDEN_VOXELS * config.voxel_size
 
     def around(center_world: jax.Array, ray_reach_m: float) -> Window:
-        changed_m = ray_reach_m + hidden_m + beyond_m + horizon_m + config.voxel_size
+        changed_m = ray_reach_m + hidden_m + horizon_m + config.voxel_size
         # Half a voxel more, so that rounding does not shrink the margin around the inner box.
         shape = geometry.window_shape(config, changed_m + horizon_m + config.voxel_size / 2)
         inner_shape = geometry.window_shape(config, changed_m)
@@ -116,11 +109,7 @@ def whole_grid(config: Config) -> Window:
 
 
 def recompute[T](
-    config: Config,
-    box: RayBox,
-    horizon_m: float,
-    function: Callable[[Window], T],
-    beyond_m: float = 0.0,
+    config: Config, box: RayBox, horizon_m: float, function: Callable[[Window], T]
 ) -> T:
     """Calls a function on the smallest window that holds all that a cloud can have changed.
 
@@ -129,12 +118,11 @@ def recompute[T](
         box: The cloud's rays.
         horizon_m: How far evidence reaches, m, a static number.
         function: Recomputes a quantity in a window.
-        beyond_m: As for `place_windows`.
 
     Returns:
         The function's result.
     """
-    small, large, fits = place_windows(config, box, horizon_m, beyond_m)
+    small, large, fits = place_windows(config, box, horizon_m)
     if (small.shape, small.inner_shape) == (large.shape, large.inner_shape):
         return compute_once(function(large))
     return cond(fits, lambda: function(small), lambda: function(large))

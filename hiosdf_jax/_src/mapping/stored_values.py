@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid.frontier import is_observed
+from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.numerics.rigid import FARTHEST_M
 from hiosdf_jax._src.state.flags import Flag
 from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, NO_FEATURE, Grid, Side
@@ -118,10 +118,13 @@ def check_grid(path: _Path, config: Config, grid: Grid) -> None:
             raise ValueError(f"{path} has grid.surface.sdf beyond {farthest:g} m")
         if not (doubt <= _ROUNDING * config.distance_horizon).all():
             raise ValueError(f"{path} has grid.surface.doubt beyond {horizon:g} m")
-        passes = np.asarray(grid.evidence.passes[x])
-        observed = is_observed(passes, hits[x], side)  # pyright: ignore[reportArgumentType]
+        passes, behind = (
+            np.asarray(counts[x], np.float32)
+            for counts in (grid.evidence.passes, grid.evidence.behind)
+        )
+        observed = is_observed(config, passes, hits[x].astype(np.float32), behind)
         if not ((steps >= 0) == observed).all():
             raise ValueError(
                 f"{path} has grid.surface.frontier of the wrong sign, expected one >= 0 in the "
-                "observed voxels and < 0 elsewhere"
+                "voxels that rays have observed and < 0 elsewhere"
             )
