@@ -195,7 +195,8 @@ def _queries(unknown: Unknown) -> Evaluate:
 
 
 def _all_answers(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
-    frontier = _frontier(field, _place(field, points))
+    place = _place(field, points)
+    frontier = _frontier_beyond(_answers_of(field).frontier(field, place.nearest), place)
     sdf, grad = _with_gradient(field, points, unknown, "sdf")
     lower, lower_grad = _with_gradient(field, points, "network", "lower")
     return Query(sdf, grad, frontier > 0, frontier, lower, lower_grad)
@@ -210,7 +211,9 @@ def _with_gradient(
 def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound) -> jax.Array:
     place = _place(field, points)
     answers = _answers_of(field)
-    frontier = _frontier(field, place)
+    at_nearest = answers.frontier(field, place.nearest)
+    frontier = _frontier_beyond(at_nearest, place)
+    is_window = isinstance(field, Baked) and field.window
     if bound == "lower":
         value = answers.lower(field, place.nearest) - place.beyond
         value = jnp.where(frontier < 0, jnp.minimum(value, frontier), value)
@@ -218,15 +221,15 @@ def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bou
         value = answers.sdf(field, place.nearest, unknown)
         # Outside a window the map may have a surface that the window does not know. Outside the
         # bounds an obstacle's gradient must lead back to them.
-        is_window = isinstance(field, Baked) and field.window
         nearer = jnp.any(jnp.isnan(points), axis=-1) | is_window | (unknown == "obstacle")
         value = value + jnp.where(nearer, -place.beyond, place.beyond)
     if unknown == "network":
         return value
     solid = jnp.minimum(value, frontier)
     # Deep in unseen space the frontier answers alone: its gradient leads out, that of a guess
-    # about what stands there need not.
-    deep = jnp.clip(-frontier / _DEEP_M, 0, 1)
+    # about what stands there need not. Outside a window it must not lift the value above that of
+    # the window's nearest point.
+    deep = jnp.clip(-(at_nearest if is_window else frontier) / _DEEP_M, 0, 1)
     return solid + deep * (frontier - solid)
 
 
@@ -242,10 +245,10 @@ def _answers_of(field: Field | Baked) -> ModuleType:
     return lattice if isinstance(field, Baked) else blend
 
 
-def _frontier(field: Field | Baked, place: _Place) -> jax.Array:
-    value = _answers_of(field).frontier(field, place.nearest)
+def _frontier_beyond(at_nearest: jax.Array, place: _Place) -> jax.Array:
+    """Computes the frontier from its value at the box's nearest points."""
     # Space outside the bounds is unseen.
-    return jnp.where(place.beyond > 0, jnp.minimum(value, 0) - place.beyond, value)
+    return jnp.where(place.beyond > 0, jnp.minimum(at_nearest, 0) - place.beyond, at_nearest)
 
 
 def _place(field: Field | Baked, points: jax.Array) -> _Place:

@@ -129,8 +129,20 @@ def nearest_patch_at(
     share = jnp.where(found, jnp.maximum(corners.weight, _LEAST_WEIGHT), 0)
     weight = share * jnp.exp(-lag)
     weight = weight / jnp.where(any_found, jnp.sum(weight, axis=0), 1)
-    sdf = jnp.sum(weight * value, axis=0)
+    sdf = _mean_with_softer_sign(weight, share, lag, distance, value)
+    spread = jnp.sum(weight * patch.spread, axis=0)
+    sdf_m = jnp.where(any_found, sdf * config.voxel_size, config.distance_horizon)
+    return Nearest(sdf_m, spread * config.voxel_size)
 
+
+def _mean_with_softer_sign(
+    weight: jax.Array, share: jax.Array, lag: jax.Array, distance: jax.Array, value: jax.Array
+) -> jax.Array:
+    """Computes the mean of the signed distances to patches, (8, ...) voxels.
+
+    Where their signs differ, it is the mean of their sizes times a mean of their signs.
+    """
+    mean = jnp.sum(weight * value, axis=0)
     fixed = jax.lax.stop_gradient(value)
     differ = (jnp.max(fixed, axis=0) > 0) & (jnp.min(fixed, axis=0) < 0)
     size = jnp.abs(value)
@@ -139,10 +151,7 @@ def nearest_patch_at(
     share = share * jnp.exp(-(1 + away * (_SIGN_POWER - 1)) * lag)
     total = jnp.sum(share * size, axis=0)
     sign = jnp.sum(share * value, axis=0) / jnp.where(differ & (total > 0), total, 1)
-    sdf = jnp.where(differ, sign * jnp.sum(weight * size, axis=0), sdf)
-    spread = jnp.sum(weight * patch.spread, axis=0)
-    sdf_m = jnp.where(any_found, sdf * config.voxel_size, config.distance_horizon)
-    return Nearest(sdf_m, spread * config.voxel_size)
+    return jnp.where(differ, sign * jnp.sum(weight * size, axis=0), mean)
 
 
 class MeanPlane(NamedTuple):
