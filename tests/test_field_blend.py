@@ -10,11 +10,11 @@ from room import CONFIG, HALF, LARGER_BOUNDS, map_of_room
 
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import blend
-from hiosdf_jax._src.grid import lookup
+from hiosdf_jax._src.grid import interpolation, lookup
 from hiosdf_jax._src.state.pytrees import surface_of
 
 grid_sdf = jax.jit(lookup.grid_sdf, static_argnums=0)
-doubt_distance = jax.jit(lookup.doubt_distance, static_argnums=0)
+doubt_distance = jax.jit(interpolation.doubt_distance, static_argnums=0)
 network_sdf = jax.jit(blend.network_sdf)
 
 

@@ -22,7 +22,7 @@ from voxels import (
     update_frontier,
 )
 
-from hiosdf_jax._src.grid import evidence, lookup, patches
+from hiosdf_jax._src.grid import evidence, interpolation, lookup, patches
 from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side, surface_of
@@ -272,8 +272,9 @@ def answers(surface, points):
 
     def distances(point):
         nearest = lookup.nearest_patch(CONFIG, surface, point)
-        doubt = lookup.doubt_distance(CONFIG, surface, point)
-        return nearest.sdf, nearest.spread, doubt, lookup.frontier_distance(CONFIG, surface, point)
+        doubt = interpolation.doubt_distance(CONFIG, surface, point)
+        frontier = interpolation.frontier_distance(CONFIG, surface, point)
+        return nearest.sdf, nearest.spread, doubt, frontier
 
     return jax.jit(lambda: (distances(points), jax.vmap(jax.jacrev(distances))(points)))()
 
@@ -295,7 +296,7 @@ def test_all_lookups_can_be_lowered_for_a_gpu(room, monkeypatch):
     surface, points = surface_of(room), jnp.asarray(uniform(5, 4096))
     monkeypatch.setattr(devices, "has_kernels", lambda: True)
     clear()
-    for find in (lookup.grid_sdf, lookup.doubt_distance, lookup.frontier_distance):
+    for find in (lookup.grid_sdf, interpolation.doubt_distance, interpolation.frontier_distance):
 
         def value(points, find=find):
             return find(CONFIG, surface, points)

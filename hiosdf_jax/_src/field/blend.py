@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Bounds, Config
-from hiosdf_jax._src.grid import lookup
+from hiosdf_jax._src.grid import interpolation, lookup
 from hiosdf_jax._src.network import siren
 from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.state.pytrees import Field, Unknown
@@ -81,7 +81,7 @@ def frontier(field: Field, points_world: jax.Array) -> jax.Array:
     Returns:
         (...) m. Differentiable.
     """
-    return lookup.frontier_distance(field.config, field.surface, points_world)
+    return interpolation.frontier_distance(field.config, field.surface, points_world)
 
 
 def lower(field: Field, points_world: jax.Array) -> jax.Array:
@@ -137,7 +137,7 @@ def cautious_sdf(field: Field, points_world: jax.Array) -> tuple[jax.Array, jax.
     limit = _LARGEST_CORRECTION_VOXELS * config.voxel_size
     gap = jnp.minimum(jnp.abs(network - nearest.sdf), limit)
     scale = _LEAST_SCALE_VOXELS * config.voxel_size + _GAP_SHARE * gap + nearest.spread
-    doubt = lookup.doubt_distance(config, field.surface, points_world)
+    doubt = interpolation.doubt_distance(config, field.surface, points_world)
     unseen = frontier(field, points_world)
     nearest, network, doubt, unseen = map(compute_once, (nearest, network, doubt, unseen))
     cautious = jnp.minimum(_combine(config, nearest.sdf, network, unseen, "network"), doubt)

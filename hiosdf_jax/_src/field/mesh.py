@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from hiosdf_jax._src.field import polygons
+from hiosdf_jax._src.field import mean_surface, polygons
 from hiosdf_jax._src.field.lattice import check_resolution
-from hiosdf_jax._src.grid import lookup
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.numerics.modes import plain
@@ -90,4 +89,4 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     )
 
 
-_move = jax.jit(plain(lookup.move_to_surface), static_argnums=0)
+_move = jax.jit(plain(mean_surface.move_to_surface), static_argnums=0)

@@ -195,8 +195,7 @@ def _queries(unknown: Unknown) -> Evaluate:
 
 
 def _all_answers(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
-    place = _place(field, points)
-    frontier = _frontier_beyond(_answers_of(field).frontier(field, place.nearest), place)
+    frontier = _frontier(field, _place(field, points))
     sdf, grad = _with_gradient(field, points, unknown, "sdf")
     lower, lower_grad = _with_gradient(field, points, "network", "lower")
     return Query(sdf, grad, frontier > 0, frontier, lower, lower_grad)
@@ -211,8 +210,7 @@ def _with_gradient(
 def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bound) -> jax.Array:
     place = _place(field, points)
     answers = _answers_of(field)
-    at_nearest = answers.frontier(field, place.nearest)
-    frontier = _frontier_beyond(at_nearest, place)
+    frontier = _frontier(field, place)
     is_window = isinstance(field, Baked) and field.window
     if bound == "lower":
         value = answers.lower(field, place.nearest) - place.beyond
@@ -229,7 +227,8 @@ def _value(field: Field | Baked, points: jax.Array, unknown: Unknown, bound: Bou
     # Deep in unseen space the frontier answers alone: its gradient leads out, that of a guess
     # about what stands there need not. Outside a window it must not lift the value above that of
     # the window's nearest point.
-    deep = jnp.clip(-(at_nearest if is_window else frontier) / _DEEP_M, 0, 1)
+    inside = frontier + place.beyond if is_window else frontier
+    deep = jnp.clip(-inside / _DEEP_M, 0, 1)
     return solid + deep * (frontier - solid)
 
 
@@ -245,10 +244,10 @@ def _answers_of(field: Field | Baked) -> ModuleType:
     return lattice if isinstance(field, Baked) else blend
 
 
-def _frontier_beyond(at_nearest: jax.Array, place: _Place) -> jax.Array:
-    """Computes the frontier from its value at the box's nearest points."""
+def _frontier(field: Field | Baked, place: _Place) -> jax.Array:
+    value = _answers_of(field).frontier(field, place.nearest)
     # Space outside the bounds is unseen.
-    return jnp.where(place.beyond > 0, jnp.minimum(at_nearest, 0) - place.beyond, at_nearest)
+    return jnp.where(place.beyond > 0, jnp.minimum(value, 0) - place.beyond, value)
 
 
 def _place(field: Field | Baked, points: jax.Array) -> _Place:

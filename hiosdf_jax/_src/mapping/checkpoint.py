@@ -14,8 +14,7 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.datasets.archive import Archive
 from hiosdf_jax._src.datasets.files import parsing
-from hiosdf_jax._src.grid.distance import recompute_distances
-from hiosdf_jax._src.grid.frontier import recompute_frontier
+from hiosdf_jax._src.mapping.derived import recompute_derived
 from hiosdf_jax._src.mapping.lifecycle import init
 from hiosdf_jax._src.mapping.stored_values import check_array, check_grid
 from hiosdf_jax._src.numerics.intake import is_traced
@@ -230,12 +229,7 @@ def _of_older_file(version: int, config: Config, grid: Grid) -> Grid:
         middle = jnp.where(turned[..., None], -axes[..., 1, :], axes[..., 1, :])
         evidence = grid.evidence.replace(axes=axes.at[..., 1, :].set(middle))
         grid = grid.replace(evidence=evidence)
-    return _recompute_derived(config, grid)
-
-
-@jax.jit(static_argnums=0)
-def _recompute_derived(config: Config, grid: Grid) -> Grid:
-    return recompute_frontier(config, recompute_distances(config, grid))
+    return jax.jit(recompute_derived, static_argnums=0)(config, grid)
 
 
 def _without_key(state: MapState) -> MapState:

@@ -10,9 +10,8 @@ import numpy as np
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
-from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid
-from hiosdf_jax._src.grid.frontier import recompute_frontier
+from hiosdf_jax._src.mapping.derived import recompute_derived
 from hiosdf_jax._src.numerics.intake import as_floats, is_traced
 from hiosdf_jax._src.numerics.masks import where_leading
 from hiosdf_jax._src.numerics.modes import plain
@@ -65,4 +64,4 @@ def _forget(config: Config, grid: Grid, corners: jax.Array) -> Grid:
 
     evidence: Evidence = jax.tree.map(clear, grid.evidence, empty_grid(config).evidence)
     grid = grid.replace(evidence=evidence)
-    return recompute_frontier(config, recompute_distances(config, grid))
+    return recompute_derived(config, grid)

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid.distance import recompute_distances
 from hiosdf_jax._src.grid.evidence import empty_grid, whole_window, write_window
-from hiosdf_jax._src.grid.frontier import recompute_frontier
+from hiosdf_jax._src.mapping.derived import recompute_derived
 from hiosdf_jax._src.mapping.joining.adding import Moved, sum_evidence
 from hiosdf_jax._src.mapping.joining.rebinning import coincides, count_lost, passes_at, rebin
 from hiosdf_jax._src.network.rigid_motion import move_network
@@ -201,7 +200,7 @@ def _join(
     empty = empty_grid(config)
     total = sum_evidence(config, windows, moved)
     grid = empty.replace(evidence=write_window(empty.evidence, total))
-    grid = recompute_frontier(config, recompute_distances(config, grid))
+    grid = recompute_derived(config, grid)
 
     # The network of the first map that has learned anything.
     first = jnp.argmax(jnp.stack(used))

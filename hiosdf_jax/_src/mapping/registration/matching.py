@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.field.queries import query
-from hiosdf_jax._src.grid import geometry, lookup
+from hiosdf_jax._src.grid import geometry, interpolation, lookup
+from hiosdf_jax._src.mapping.registration import planes
 from hiosdf_jax._src.mapping.registration.motion import offsets_from
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, split
 from hiosdf_jax._src.state.pytrees import Baked, Field, Surface
@@ -129,9 +130,9 @@ def match_at(
     size = config.voxel_size
     _, pull, nearest = jax.vjp(nearest_at, point_world, has_aux=True)
     (own_normal,) = pull(jnp.ones_like(nearest.sdf))
-    plane = lookup.nearest_plane_at(config, surface, point_world)
+    plane = planes.nearest_plane_at(config, surface, point_world)
     clamped = geometry.clamp(config, point_world)
-    depth = -lookup.frontier_at(config, surface, clamped)
+    depth = -interpolation.frontier_at(config, surface, clamped)
     x, y, z = each(jnp.equal, point_world, clamped)
     inside = x & y & z
     empty = inside & (depth < -_FREE_VOXELS * size) & (plane.away > _EMPTY_VOXELS * size)
