@@ -10,6 +10,7 @@ from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import FREE_RATIO, is_free
 from hiosdf_jax._src.grid.nearest import Part, nearest_sites
 from hiosdf_jax._src.grid.rays import HIDDEN_VOXELS
+from hiosdf_jax._src.grid.rectangles import REACH_VOXELS, nearest_rectangles, with_margin
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
 from hiosdf_jax._src.numerics.barriers import compute_once
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, take
@@ -60,7 +61,7 @@ def update_distances(config: Config, grid: Grid, box: RayBox) -> Grid:
     Returns:
         The grid with nearest, sdf and doubt as if recomputed everywhere.
     """
-    horizon_m = config.horizon_voxels * config.voxel_size
+    horizon_m = (config.horizon_voxels + REACH_VOXELS) * config.voxel_size
 
     def inside(window: Window) -> Derived:
         return _distances_in(config, grid, window)
@@ -78,6 +79,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     start, shape, inner_start, inner = window
     within = window.within
     part = Part(within, inner)
+    larger = with_margin(shape, part)
     hits, passes, behind, mean, axes = (
         geometry.read_window(array, start, shape)
         for array in (
@@ -93,8 +95,11 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     features = patches.is_feature(config, hits, passes, axes)
     doubtful = patches.is_doubtful(hits, passes)
     sites = jnp.stack([features, doubtful])
-    indices, squares = nearest_sites(sites, mean, config.horizon_voxels, part, order)
-    nearest, squared = indices[0], squares[1]
+    horizon = config.horizon_voxels
+    indices, squares = nearest_sites(sites, mean, horizon, larger, order)
+    inside = tuple(a - b for a, b in zip(within, larger.start, strict=True))
+    nearest = nearest_rectangles(indices[0], horizon, larger, mean, axes)
+    nearest, squared = (geometry.read_window(x, inside, inner) for x in (nearest, squares[1]))
     doubt = jnp.minimum(jnp.sqrt(squared) * config.voxel_size, config.distance_horizon)
 
     # From the centers of the part's voxels to their nearest patches.
