@@ -150,7 +150,7 @@ def slow_distance(grid, point_world):
     weights, distances, values = map(np.array, zip(*found, strict=True))
     near = weights * np.exp(-distances / 0.14)
     away = np.dot(near, distances) / near.sum()
-    power = np.interp(away, [0.2, 0.45], [1, 0.3])
+    power = np.interp(away, [0.1, 0.3], [1, 0.3])
     even = weights * np.exp(-power * distances / 0.14)
     size = np.dot(near, np.abs(values)) / near.sum()
     return 0.1 * size * np.dot(even, values) / np.dot(even, np.abs(values))

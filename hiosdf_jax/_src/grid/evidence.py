@@ -19,9 +19,13 @@ _STORED = jnp.float16
 # Rounding to float16 multiplies a number by at most 1 + 2^-11 = 1.0005.
 _ROUNDING = 1.0007
 
-# A voxel is free with at least this many passes per ray that ended just before it, and holds a
-# surface with at least this many hits: noise puts some ends of rays too far away.
+# A voxel is free with at least this many passes per ray that ended just before it: noise puts some
+# ends of rays too far away.
 FREE_RATIO = 0.1
+
+# It holds an observed surface with at least this many hits per such ray. Fewer are noise behind a
+# surface or returns past an edge. With 0.1, twice as many sign changes lie far from any surface.
+_SURFACE_RATIO = 0.5
 
 
 class EvidenceWindow(NamedTuple):
@@ -209,7 +213,7 @@ def is_observed[A: (jax.Array, np.ndarray)](config: Config, passes: A, hits: A, 
     Returns:
         (...) bool.
     """
-    surface = (hits >= config.min_hits) & (hits >= FREE_RATIO * behind)
+    surface = (hits >= config.min_hits) & (hits >= _SURFACE_RATIO * behind)
     return (passes >= 0) & (is_free(passes, behind) | surface)
 
 

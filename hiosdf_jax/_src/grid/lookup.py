@@ -32,11 +32,11 @@ from hiosdf_jax._src.state.pytrees import NO_FEATURE, Derived, Side, Surface
 # much leaves more steps where the eight voxels change.
 _SOFT_VOXELS = 0.14
 
-# Where signs differ, the sign is a mean of its own. Next to patches it has the weights of the
-# distance. Away from them, between these distances, voxels, it has the weights to a power that
-# falls to this one: otherwise the distance would fall steeply from one sign to the other.
+# Where signs differ, the sign is a mean of its own. On patches it has the weights of the distance.
+# Between these distances from them, voxels, it has the weights to a power that falls to this one:
+# otherwise the distance would fall steeply from one sign to the other.
 _SIGN_POWER = 0.3
-_SIGN_VOXELS = (0.2, 0.45)
+_SIGN_VOXELS = (0.1, 0.3)
 
 LEAST_WEIGHT = 1e-6
 """The only patch around a point counts also where its trilinear weight is 0."""
