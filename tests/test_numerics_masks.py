@@ -11,6 +11,7 @@ from hiosdf_jax._src.numerics import masks
 # Compiled as wholes: one operation after another compiles each for itself.
 rank_mask, indices_of_true = jax.jit(masks.rank_mask), jax.jit(masks.indices_of_true)
 first_true_indices = jax.jit(masks.first_true_indices, static_argnums=1)
+spread_rows = jax.jit(masks.spread_rows, static_argnums=1)
 
 
 @settings(deadline=None)
@@ -57,3 +58,15 @@ def test_running_sums_and_bisection_are_those_of_numpy(monkeypatch, device, size
     np.testing.assert_array_equal(
         masks.count_below(sums, wanted), np.searchsorted(np.cumsum(values), wanted)
     )
+
+
+@pytest.mark.parametrize("size", [1, 33, 300])
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_rows_spread_over_a_mask_are_every_so_many_of_those_that_hold(size, share):
+    mask = np.random.default_rng(size).random(size) < share
+    held, count = np.flatnonzero(mask), 40
+    rows = np.asarray(spread_rows(mask, count))
+    assert ((rows >= 0) & (rows < size)).all()
+    if held.size:
+        number = np.arange(count, dtype=np.float32) * np.float32(held.size / count)
+        np.testing.assert_array_equal(rows, held[number.astype(int)])

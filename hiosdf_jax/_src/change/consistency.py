@@ -17,7 +17,7 @@ from hiosdf_jax._src.change.misplaced import is_misplaced
 from hiosdf_jax._src.change.piercing import find_piercing
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.masks import indices_of_true, rank_mask
+from hiosdf_jax._src.numerics.masks import spread_rows
 from hiosdf_jax._src.numerics.modes import run_if
 from hiosdf_jax._src.state.pytrees import Grid
 
@@ -102,7 +102,7 @@ def judge(
     Returns:
         The verdict.
     """
-    row = _spread_rows(rays.in_range)
+    row = spread_rows(rays.in_range, min(rays.in_range.size, _JUDGED))
     some = Rays(*(part if part is rays.sensor_world else part[row] for part in rays))
     known, novel, distance = (part[row] for part in compared)
     piercing = find_piercing(config, grid, some)
@@ -110,10 +110,9 @@ def judge(
     near = known & ~novel & (distance < _AGREEING_VOXELS * config.voxel_size)
     counted = (some.in_range, piercing, known & novel, near)
     total, through, in_free, agreeing = (jnp.sum(rows) for rows in counted)
-    comparable = jnp.sum(known) + through
+    comparable, wrong = jnp.sum(known) + through, in_free + through
 
     def exceeds(most: float, least: float) -> jax.Array:
-        wrong = in_free + through
         return (wrong > most * comparable) & (wrong > least * total)
 
     def look(_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -139,15 +138,7 @@ def judge(
     def search(_: jax.Array) -> jax.Array:
         return is_misplaced(config, grid, some, piercing | (known & novel))
 
-    searched = (updates >= CONFIDENT_UPDATES) & (in_free + through > _LEAST_MISPLACED * total)
+    searched = (updates >= CONFIDENT_UPDATES) & (wrong > _LEAST_MISPLACED * total)
     misplaced = run_if(searched, search, jnp.zeros((), bool), grid, some, piercing, known, novel)
     misplaced &= ~fills_view(_MOST_PIERCING_ELSEWHERE, _LEAST_BESIDE_ELSEWHERE)
     return CloudVerdict(~(contradicts | noise | misplaced), noise)
-
-
-def _spread_rows(mask: jax.Array) -> jax.Array:
-    """Returns about a thousand rows where a mask (N,) holds, spread evenly, (K,) int32."""
-    count, ranked = min(mask.size, _JUDGED), rank_mask(mask)
-    number = jnp.arange(count, dtype=jnp.float32) * (ranked.total / count)
-    row = indices_of_true(ranked, number.astype(jnp.int32))
-    return jnp.clip(row, 0, mask.size - 1)

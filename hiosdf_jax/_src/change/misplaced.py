@@ -15,7 +15,7 @@ import numpy as np
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.masks import indices_of_true, rank_mask
+from hiosdf_jax._src.numerics.masks import spread_rows
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state.pytrees import Grid
 
@@ -62,9 +62,7 @@ def is_misplaced(config: Config, grid: Grid, rays: Rays, wrong: jax.Array) -> ja
         () bool. Poses up to 1.35 m away along x and along y, and 25 degrees about z, are found.
     """
     usable = rays.ends & rays.inside
-    ranked = rank_mask(usable)
-    row = indices_of_true(ranked, (jnp.arange(_RAYS, dtype=jnp.int32) * ranked.total) // _RAYS)
-    row = jnp.minimum(row, usable.size - 1)
+    row = spread_rows(usable, _RAYS)
     chosen = usable[row]
     offset = rays.points_world[row] - rays.sensor_world
     sdf, steps = grid.derived.sdf.ravel(), grid.derived.frontier_steps.ravel()

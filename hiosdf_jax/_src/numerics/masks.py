@@ -118,6 +118,21 @@ def first_true_indices(mask: jax.Array, count: int) -> jax.Array:
     return jnp.where(number < ranked.total, indices_of_true(ranked, number), mask.size)
 
 
+def spread_rows(mask: jax.Array, count: int) -> jax.Array:
+    """Selects rows where a mask (N,), not empty, holds, spread evenly over all that do.
+
+    Args:
+        mask: (N,) bool.
+        count: Rows to select; they repeat where fewer hold.
+
+    Returns:
+        (count,) int32. Where no row holds, rows that do not.
+    """
+    ranked = rank_mask(mask)
+    number = jnp.arange(count, dtype=jnp.float32) * (ranked.total / count)
+    return jnp.clip(indices_of_true(ranked, number.astype(jnp.int32)), 0, mask.size - 1)
+
+
 def count_below(ascending: jax.Array, values: jax.Array) -> jax.Array:
     """Counts the elements (M,), M > 0, that are less than each value (N,), by bisection."""
     if jax.default_backend() != "cpu":  # the unrolled steps are one kernel
