@@ -97,8 +97,8 @@ def patch_at(grid, cell, point):
     axes = np.asarray(grid.evidence.axes[tuple(cell)], np.float64)
     offset = point - mean
     height = offset @ axes[2] / np.linalg.norm(axes[2])
-    # Smaller by up to a fifth between 1.5 and 3.5 voxels from its center.
-    shrinking = 0.2 * np.clip((offset @ offset - 1.5**2) / (3.5**2 - 1.5**2), 0, 1)
+    # Smaller by up to 14 % between 2 and 5 voxels from its center.
+    shrinking = 0.14 * np.clip((offset @ offset - 2**2) / (5**2 - 2**2), 0, 1)
     for axis in axes[:2]:
         half = 0.9 * 3**0.5 * (1 - shrinking) * axis
         offset = offset - np.clip(offset @ half / (half @ half), -1, 1) * half

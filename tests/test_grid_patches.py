@@ -115,10 +115,10 @@ def test_the_nearest_point_on_a_patch_against_a_dense_rectangle(seed, half):
     rng = np.random.default_rng(seed)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
     axes = rotation * np.array([*half, 0.01])[:, None]
-    mean, point = rng.uniform(-0.5, 0.5, 3), rng.uniform(-3, 3, 3)
-    # Smaller by up to a fifth between 1.5 and 3.5 voxels from its center.
+    mean, point = rng.uniform(-0.5, 0.5, 3), rng.uniform(-4, 4, 3)
+    # Smaller by up to 14 % between 2 and 5 voxels from its center.
     square = np.sum((point - mean) ** 2)
-    scale = 0.9 * 3**0.5 * (1 - 0.2 * np.clip((square - 1.5**2) / (3.5**2 - 1.5**2), 0, 1))
+    scale = 0.9 * 3**0.5 * (1 - 0.14 * np.clip((square - 2**2) / (5**2 - 2**2), 0, 1))
     u = np.linspace(-1, 1, 401)
     rectangle = mean + scale * (u[:, None, None] * axes[0] + u[None, :, None] * axes[1]).reshape(
         -1, 3
@@ -140,7 +140,7 @@ def test_the_slope_of_the_distance_to_a_patch_against_finite_differences():
     count = 4000
     rotation = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     axes = rotation * rng.uniform(0, 0.35, (count, 3, 1))
-    mean, point = rng.uniform(-0.5, 0.5, (count, 3)), rng.uniform(-3, 3, (count, 3))
+    mean, point = rng.uniform(-0.5, 0.5, (count, 3)), rng.uniform(-4, 4, (count, 3))
     with jax.enable_x64(True):
         held = (split(jnp.asarray(x)) for x in (mean, axes[:, 0], axes[:, 1], 0 * mean))
         mean64, first, second, center = held

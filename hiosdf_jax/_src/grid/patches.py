@@ -27,9 +27,10 @@ EXTENT_DEVIATIONS = 0.9 * 3**0.5
 
 # Between these distances of its center, voxels, a patch shrinks by up to this share. At the edges
 # of surfaces, patches reach beyond the surface: points off the edge would be too near. Next to a
-# wall, smaller patches would leave gaps.
-_FAR_SHRINKING = 0.2
-_FAR_VOXELS = (1.5, 3.5)
+# wall, smaller patches would leave gaps. With 0.2, the distances on a LiDAR stream are 0.05 cm
+# larger on average.
+_FAR_SHRINKING = 0.14
+_FAR_VOXELS = (2.0, 5.0)
 
 # A patch may reach this far out of its voxel, voxels. Otherwise narrow gaps open between patches,
 # and the distances before surfaces that a LiDAR saw are 0.03 cm larger on average.
