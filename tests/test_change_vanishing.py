@@ -228,6 +228,18 @@ def test_a_patch_that_one_ray_crosses_goes_with_four_neighbors(
     assert (state_of(after) == (0, -72)) == vanishes
 
 
+@pytest.mark.parametrize("gone_nearby", [False, True])
+def test_stray_returns_that_vanish_take_no_patch_along(gone_nearby):
+    """Single hits around a thin leg are no thing that has left, but in the wake of one they are."""
+    config = dataclasses.replace(CONFIG, min_hits=2)
+    window = patch()._replace(hits=patch().hits.at[CELL].set(1))
+    if gone_nearby:
+        beside = tuple(np.add(CELL, (1, 1, 1)))
+        window = window._replace(change=window.change.at[beside].set(-72))
+    after, _ = scan(window, through(ALL), config)
+    assert state_of(after) == (0, -72 if gone_nearby else 0)
+
+
 def test_vanished_places_are_forgotten_after_eight_scans_that_pass_them():
     window = patch()
     for _ in range(2):

@@ -192,7 +192,7 @@ def test_unseen_space_is_an_obstacle_on_request(room_map):
     inside = np.clip(points, *BOUNDS)
     grid = np.asarray(grid_sdf(room_map.grid, inside), np.float64)
     network = np.asarray(network_sdf(hio.snapshot(room_map), inside), np.float64)
-    limit = np.minimum(0.1, np.abs(grid))
+    limit = np.clip(np.abs(grid) - 0.02, 0, 0.1)
     near = grid + 0.1 * np.clip(network - grid, -limit, limit)
     far = np.clip((np.abs(grid) - 0.8) / 0.2, 0, 1)
     there = np.asarray(hio.query(room_map, inside).frontier, np.float64)

@@ -121,8 +121,8 @@ def test_a_voxel_is_reached_unless_it_is_hidden_or_no_ray_has_met_it():
         (-5, 20, 0, False),  # hidden by a new surface
         (0, 1, 0, False),  # one return is no surface
         (0, 2, 0, True),
-        (0, 2, 4, True),
-        (0, 2, 5, False),  # noise behind a surface
+        (0, 4, 4, True),
+        (0, 4, 5, False),  # noise behind a surface
         (2, 2, 100, False),
     ],
 )
@@ -130,6 +130,11 @@ def test_a_voxel_is_observed_if_it_is_free_or_holds_a_surface(passes, hits, behi
     counts = (jnp.float32(count) for count in (passes, hits, behind))
     config = dataclasses.replace(CONFIG, min_hits=2)
     assert bool(evidence.is_observed(config, *counts)) == expected
+
+
+def test_one_hit_is_an_observed_surface_where_one_is_asked_for():
+    config = dataclasses.replace(CONFIG, min_hits=1)
+    assert bool(evidence.is_observed(config, *map(jnp.float32, (0, 1, 0))))
 
 
 def test_hidden_voxels_and_changes_are_stored():

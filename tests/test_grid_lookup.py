@@ -170,7 +170,14 @@ def test_distance_is_about_that_to_the_nearest_of_all_patches(room):
     """The mean of the patches around a point is near the least distance, also where walls have
     gaps, and never much farther."""
     cells = np.argwhere(
-        patches.is_feature(CONFIG, room.evidence.hits, room.evidence.passes, room.evidence.axes)
+        patches.is_feature(
+            CONFIG,
+            room.evidence.hits,
+            room.evidence.passes,
+            room.evidence.root_weight.astype(jnp.float32) ** 2,
+            room.evidence.axes,
+        )
+        & ~patches.is_behind_surface(room.evidence.hits, room.evidence.passes, room.evidence.behind)
     )
     points, known = uniform(12, 100), jax.tree.map(np.asarray, room)
     exact = np.array(

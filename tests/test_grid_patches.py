@@ -170,7 +170,9 @@ def test_a_vanished_wall_is_carved_and_a_new_one_counts_as_surface():
     for cloud in [near] * 30 + [far] * 60:
         window = trace(fuse(window, cloud, sensor), cloud, sensor)
         window = fade_evidence(CONFIG, window)
-        features = patches.is_feature(CONFIG, window.hits, window.passes, window.axes)
+        features = patches.is_feature(
+            CONFIG, window.hits, window.passes, window.weight, window.axes
+        )
         history.append((bool(features[7, 5, 4]), bool(features[11, 5, 4])))
     assert float(jnp.max(window.hits + window.passes)) <= CONFIG.evidence_limit * 1.001
     assert history[29] == (True, False)
@@ -186,9 +188,37 @@ def test_hidden_patches_are_still_surfaces_as_they_were():
     hits, passes = (rng.integers(0, 60, 500).astype(np.float32) for _ in range(2))
     axes = np.zeros((500, 3, 3), np.float32)
     axes[:, 0, 0] = axes[:, 1, 1] = rng.uniform(0.01, 0.3, 500)
-    seen, hidden = (patches.is_feature(CONFIG, hits, s * passes, axes) for s in (1, -1))
+    seen, hidden = (patches.is_feature(CONFIG, hits, s * passes, 0 * hits, axes) for s in (1, -1))
     np.testing.assert_array_equal(hidden, seen)
     assert 0.1 < np.mean(seen) < 0.95
+
+
+@pytest.mark.parametrize(
+    ("half", "sigma_voxels", "share"),
+    [(0.29, 0.1, 1.0), (0.29, 0.3, 1.0), (0.15, 0.1, 0.6), (0.15, 0.3, 1.0)],
+)
+def test_small_patches_of_sharp_returns_need_fewer_hits(half, sigma_voxels, share):
+    """By a loop over passes: a patch is carved below its share of the rays."""
+    axes = jnp.diag(jnp.array([0.29, half, 0.01]))
+    noise_floor, _ = CONFIG.range_noise
+    weight = 20 * (noise_floor / (sigma_voxels * CONFIG.voxel_size)) ** 2
+    area = min(2 * 0.9 * 3**0.5 * 0.29, 1) * min(2 * 0.9 * 3**0.5 * half, 1)
+    least = share * CONFIG.min_hit_ratio * area
+    for passes in range(0, 400, 7):
+        kept = patches.is_feature(CONFIG, jnp.float32(20), jnp.float32(passes), weight, axes)
+        assert bool(kept) == (20 / (20 + passes) >= least)
+    # Three hits may be what is left of something that has moved on: all need the whole share.
+    for ratio, expected in ((0.8, False), (1.2, True)):
+        passes = jnp.float32(3 / (ratio * CONFIG.min_hit_ratio * area) - 3)
+        kept = patches.is_feature(CONFIG, jnp.float32(3), passes, 0.15 * weight, axes)
+        assert bool(kept) == expected
+
+
+def test_few_hits_behind_many_ends_are_noise():
+    hits, behind = np.meshgrid(np.arange(20.0), np.arange(0.0, 101, 5))
+    for passes, share in ((0.0, 0.1), (-3.0, 0.1), (2.0, 0.03)):
+        noise = patches.is_behind_surface(hits, passes + 0 * hits, behind)
+        np.testing.assert_array_equal(noise, np.float32(hits) < np.float32(share * behind))
 
 
 def test_a_single_hit_is_in_doubt_sooner():

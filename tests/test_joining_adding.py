@@ -32,7 +32,7 @@ def view(seeds, low=(0.0, 0.1, 0.3), high=(0.5, 0.8, 0.8)):
 
 
 def is_surface(window):
-    return np.asarray(is_feature(CONFIG, window.hits, window.passes, window.axes))
+    return np.asarray(is_feature(CONFIG, window.hits, window.passes, window.weight, window.axes))
 
 
 def spread_of(window):

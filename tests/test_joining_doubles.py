@@ -203,7 +203,7 @@ def test_rays_of_a_moved_map_carve_stray_hits_where_its_voxels_overlap_unseen_on
     def is_there(passed):
         through = np.full(SHAPE, passed, np.float32)
         total = sum_of([stray, wall], [through], np.array(False))
-        known = np.asarray(total.hits), np.asarray(total.passes), np.asarray(total.axes)
+        known = map(np.asarray, (total.hits, total.passes, total.weight, total.axes))
         return bool(is_feature(CONFIG, *known)[5, 5, 3])
 
     assert is_there(3.0)

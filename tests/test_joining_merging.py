@@ -91,8 +91,11 @@ def test_a_larger_box_loses_no_surface(room_map):
 def features(state):
     """Number of the voxels whose patch counts as surface."""
     known = state.grid.evidence
-    hits, passes = (jnp.asarray(part, jnp.float32) for part in (known.hits, known.passes))
-    return int(jnp.sum(patches.is_feature(state.config, hits, passes, known.axes)))
+    hits, passes, root_weight = (
+        jnp.asarray(part, jnp.float32) for part in (known.hits, known.passes, known.root_weight)
+    )
+    surface = patches.is_feature(state.config, hits, passes, root_weight**2, known.axes)
+    return int(jnp.sum(surface))
 
 
 @pytest.mark.parametrize("rotvec", [(0, 0, 0), (0, 0, np.pi)])
@@ -164,8 +167,10 @@ def test_a_thing_that_one_map_has_met_is_solid_in_both_orders(halves):
     assert (np.asarray(known.passes)[thing] > 0).all()
     for pair in ((free, met), (met, free)):
         total = hio.merge(*pair, EYE).grid.evidence
-        passes = total.passes.astype(jnp.float32)
-        surface = patches.is_feature(CONFIG, total.hits.astype(jnp.float32), passes, total.axes)
+        hits, passes, root_weight = (
+            x.astype(jnp.float32) for x in (total.hits, total.passes, total.root_weight)
+        )
+        surface = patches.is_feature(CONFIG, hits, passes, root_weight**2, total.axes)
         assert np.asarray(surface)[thing].all()
 
 

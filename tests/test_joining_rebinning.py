@@ -57,8 +57,10 @@ def moved(stored, pose, target=TARGET):
 
 
 def features(config, known):
-    hits, passes = (np.asarray(x, np.float32) for x in (known.hits, known.passes))
-    return np.asarray(is_feature(config, hits, passes, known.axes))
+    hits, passes, root_weight = (
+        np.asarray(x, np.float32) for x in (known.hits, known.passes, known.root_weight)
+    )
+    return np.asarray(is_feature(config, hits, passes, root_weight**2, known.axes))
 
 
 @pytest.mark.parametrize("turn", [None, [0, 0, np.pi / 2], [np.pi / 2, 0, 0], [0, np.pi, 0]])
@@ -152,7 +154,8 @@ def test_stray_hits_that_meet_are_no_surface(stored):
     single = stored.replace(hits=hits, passes=jnp.zeros_like(stored.passes))
     window = rebin(strict, single, target, jnp.asarray(POSE, jnp.float32))
     assert float(window.hits.max()) == 1
-    assert not np.asarray(is_feature(target, window.hits, window.passes, window.axes)).any()
+    counts = window.hits, window.passes, window.weight
+    assert not np.asarray(is_feature(target, *counts, window.axes)).any()
 
 
 def test_a_voxel_is_seen_only_where_all_voxels_that_it_overlaps_are(stored):

@@ -78,9 +78,9 @@ def test_load_names_what_is_wrong(room_map, tmp_path):
     with pytest.raises(ValueError, match=r"has grid\.hits of float16"):
         hio.load(path)
     for version in (1, 99):
-        other = str(arrays["header"]).replace('"version": 6', f'"version": {version}')
+        other = str(arrays["header"]).replace('"version": 7', f'"version": {version}')
         np.savez(path, **(arrays | {"header": np.asarray(other)}))
-        with pytest.raises(ValueError, match=f"format version {version}, expected 2 to 6"):
+        with pytest.raises(ValueError, match=f"format version {version}, expected 2 to 7"):
             hio.load(path)
     # Only files of older versions may lack what newer ones have added.
     for name in (*NEW_ARRAYS, "grid.surface.side"):
@@ -278,7 +278,7 @@ def test_a_file_of_format_version_3_keeps_its_changes(tmp_path):
 def test_names_in_a_file_do_not_change(tmp_path):
     """They are part of its format; attributes of the code may be renamed."""
     header, arrays = file_of_version_3()
-    header["version"], arrays["grid.surface.side"] = 6, np.zeros((4, 3, 2), np.int8)
+    header["version"], arrays["grid.surface.side"] = 7, np.zeros((4, 3, 2), np.int8)
     config = hio.Config(**header["config"])
     hio.save(tmp_path / "map.npz", hio.init(config, jax.random.key(0)))
     with np.load(tmp_path / "map.npz") as file:

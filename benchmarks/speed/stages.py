@@ -126,12 +126,12 @@ def _searched(config: Config, box: RayBox, horizon_voxels: int) -> Window:
 
 def _sites(config: Config, known: Evidence, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """The voxels that the two searches of the distance transform look for."""
-    hits, passes, axes = (
-        geometry.read_window(array, window.start, window.shape)
-        for array in (known.hits, known.passes, known.axes)
+    hits, passes, behind, root_weight, axes = (
+        geometry.read_window(array, window.start, window.shape).astype(jnp.float32)
+        for array in (known.hits, known.passes, known.behind, known.root_weight, known.axes)
     )
-    hits, passes = hits.astype(jnp.float32), passes.astype(jnp.float32)
-    features = patches.is_feature(config, hits, passes, axes)
+    features = patches.is_feature(config, hits, passes, root_weight**2, axes)
+    features &= ~patches.is_behind_surface(hits, passes, behind)
     return np.asarray(features), np.asarray(patches.is_doubtful(hits, passes))
 
 

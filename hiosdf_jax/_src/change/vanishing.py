@@ -114,7 +114,10 @@ def drop_vanished(
         values = jnp.broadcast_to(values, voxel.shape).astype(array.dtype)
         return array.ravel().at[voxel].set(values, mode="drop").reshape(array.shape)
 
-    change = put(change, jnp.where(vanished, _GONE, counted))
+    # Stray returns vanish too. Away from other changes they belonged to no thing.
+    near_change = with_neighbors(is_recent(change)).ravel()[row]
+    mark = jnp.where((hits >= config.min_hits) | near_change, _GONE, 0)
+    change = put(change, jnp.where(vanished, mark, counted))
 
     def spread(vanished: jax.Array) -> jax.Array:
         """Adds the remains of objects: edges that few rays meet vanish with their objects."""
@@ -122,7 +125,7 @@ def drop_vanished(
         mapped = inside & (window.hits.ravel()[around] > 0)
 
         def once(_: jax.Array, vanished: jax.Array) -> jax.Array:
-            gone = put(change, jnp.where(vanished, _GONE, counted)).ravel()[around] < _FORGOTTEN
+            gone = put(change, jnp.where(vanished, mark, counted)).ravel()[around] < _FORGOTTEN
             count = jnp.sum(inside & gone, axis=1)
             left = jnp.sum(mapped & ~gone, axis=1)
             most = looked_at.ravel()[row] | (count >= _LEAST_GONE_RATIO * left)
@@ -135,7 +138,7 @@ def drop_vanished(
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_IF_MET
     vanished = run_if(many, spread, vanished, window, rays)
     window = window._replace(change=put(change, counted))
-    return clear_patches(window, jnp.where(vanished, voxel, voxels), _GONE)
+    return clear_patches(window, jnp.where(vanished, voxel, voxels), mark)
 
 
 def _around(shape: tuple[int, ...], row: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -80,19 +80,23 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     within = window.within
     part = Part(within, inner)
     larger = with_margin(shape, part)
-    hits, passes, behind, mean, axes = (
+    hits, passes, behind, root_weight, mean, axes = (
         geometry.read_window(array, start, shape)
         for array in (
             grid.evidence.hits,
             grid.evidence.passes,
             grid.evidence.behind,
+            grid.evidence.root_weight,
             grid.evidence.mean,
             grid.evidence.axes,
         )
     )
-    hits, passes, behind = (x.astype(jnp.float32) for x in (hits, passes, behind))
+    hits, passes, behind, root_weight = (
+        x.astype(jnp.float32) for x in (hits, passes, behind, root_weight)
+    )
     order = axis_order(config)
-    features = patches.is_feature(config, hits, passes, axes)
+    features = patches.is_feature(config, hits, passes, root_weight**2, axes)
+    features &= ~patches.is_behind_surface(hits, passes, behind)
     doubtful = patches.is_doubtful(hits, passes)
     sites = jnp.stack([features, doubtful])
     horizon = config.horizon_voxels

@@ -23,8 +23,9 @@ _ROUNDING = 1.0007
 # ends of rays too far away.
 FREE_RATIO = 0.1
 
-# It holds an observed surface with at least this many hits per such ray. Fewer are noise behind a
-# surface or returns past an edge. With 0.1, twice as many sign changes lie far from any surface.
+# It holds an observed surface with this many hits per such ray, beside `min_hits`. Fewer are noise
+# behind a surface or returns past an edge. With 0.1, twice as many sign changes lie far from any
+# surface.
 _SURFACE_RATIO = 0.5
 
 
@@ -145,14 +146,16 @@ def fade_evidence(config: Config, window: EvidenceWindow) -> EvidenceWindow:
     )
 
 
-def clear_patches(window: EvidenceWindow, voxels: jax.Array, change: int) -> EvidenceWindow:
+def clear_patches(
+    window: EvidenceWindow, voxels: jax.Array, change: int | jax.Array
+) -> EvidenceWindow:
     """Removes patches; their voxels are free.
 
     Args:
         window: The window.
         voxels: Indices into the raveled window, (K,) int32, each once or more often; those at or
             above its size are skipped.
-        change: The voxels' `change` afterwards.
+        change: Their `change` afterwards, one number or (K,).
 
     Returns:
         The window.
@@ -167,7 +170,7 @@ def clear_patches(window: EvidenceWindow, voxels: jax.Array, change: int) -> Evi
         weight=put(window.weight, 0),
         behind=put(window.behind, 0),
         passes=put(window.passes, jnp.maximum(jnp.abs(passes), 1)),
-        change=put(window.change, change),
+        change=put(window.change, jnp.asarray(change, window.change.dtype)),
     )
 
 
@@ -213,7 +216,7 @@ def is_observed[A: (jax.Array, np.ndarray)](config: Config, passes: A, hits: A, 
     Returns:
         (...) bool.
     """
-    surface = (hits >= config.min_hits) & (hits >= _SURFACE_RATIO * behind)
+    surface = hits >= config.min_hits + _SURFACE_RATIO * behind
     return (passes >= 0) & (is_free(passes, behind) | surface)
 
 

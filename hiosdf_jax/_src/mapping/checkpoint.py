@@ -23,7 +23,7 @@ from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.pytrees import Grid, MapState
 
 _FORMAT = "hiosdf_jax map"
-_VERSION = 6
+_VERSION = 7
 
 # Names in the file are part of its format; attributes of the code may be renamed.
 _FILE_NAMES = {
@@ -170,7 +170,7 @@ def load(path: str | os.PathLike[str]) -> MapState:
             for name, leaf in expected.items()
         ]
     state = jax.tree.unflatten(jax.tree.structure(template), leaves)
-    if version < 6:
+    if version < 7:
         state = state.replace(grid=_of_older_file(version, config, state.grid))
     check_grid(path, config, state.grid)
     return state.replace(key=jax.random.wrap_key_data(state.key, impl=key_impl))

@@ -30,8 +30,10 @@ _SEEN = 2.0**-8
 
 def is_surface(config: Config, window: EvidenceWindow) -> jax.Array:
     """Returns a mask of the patches that count as surface once they are stored, (X, Y, Z)."""
-    stored = (rounded(array) for array in (window.hits, window.passes, window.axes))
-    return patches.is_feature(config, *stored)
+    hits, passes, root_weight, axes = (
+        rounded(x) for x in (window.hits, window.passes, jnp.sqrt(window.weight), window.axes)
+    )
+    return patches.is_feature(config, hits, passes, root_weight**2, axes)
 
 
 def is_sure(window: EvidenceWindow) -> jax.Array:

@@ -140,8 +140,12 @@ def count_lost(
     """
     _, _, cell = _move_means(source, evidence, target, pose)
     _, inside = _index_of(target, cell)
-    hits, passes = (array.ravel().astype(jnp.float32) for array in (evidence.hits, evidence.passes))
-    is_surface = patches.is_feature(source, hits, passes, evidence.axes.reshape(-1, 3, 3))
+    hits, passes, root_weight = (
+        array.ravel().astype(jnp.float32)
+        for array in (evidence.hits, evidence.passes, evidence.root_weight)
+    )
+    axes = evidence.axes.reshape(-1, 3, 3)
+    is_surface = patches.is_feature(source, hits, passes, root_weight**2, axes)
     return jnp.sum(is_surface & ~inside), jnp.sum(is_surface)
 
 
@@ -192,7 +196,9 @@ def _move_patches(
 
     level = (hits > 0).astype(jnp.int32)
     level = jnp.where(patches.is_doubtful(hits, passes), _DOUBTFUL, level)
-    level = jnp.where(patches.is_feature(target, hits, passes, axes), _SURFACE, level)
+    level = jnp.where(
+        patches.is_feature(target, hits, passes, root_weight**2, axes), _SURFACE, level
+    )
     surest = jnp.zeros(voxels, jnp.int32).at[voxel].max(level, mode="drop")
     counts = inside & (level > _NO_PATCH) & (level == surest[jnp.minimum(voxel, voxels - 1)])
     voxel = jnp.where(counts, voxel, voxels)
