@@ -59,7 +59,7 @@ _LEAST_AREA = 0.2
 _SMALL_AREA = 0.5
 _SHARP_SHARE = 0.6
 _SHARP_VOXELS = 0.2
-_SHARP_HITS = 4
+_SHARP_HITS = 6
 
 # A patch needs this many hits per ray that ended just before its voxel: fewer are noise behind a
 # surface. The first number holds where no ray passed, the second one elsewhere. Without them, twice
