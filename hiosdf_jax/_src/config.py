@@ -59,8 +59,8 @@ class Config:
         Grid [IV-B]:
         min_hits: Hits that a voxel needs before its patch counts as surface.
         min_hit_ratio: A patch that fills its voxel is carved below this share
-            hits / (hits + passes); smaller patches need less, by their area, and patches of returns
-        with little noise need 0.6 of that.
+            hits / (hits + passes); smaller patches need less, by their area. Small patches of
+            returns with little noise need 0.6 of that.
         evidence_limit: Rays that a voxel remembers; older evidence fades beyond that.
         vanish_scans: Scans that must look through most of a surface patch, without a hit between
             them, before it vanishes. Patches of few hits need fewer scans. A scan with rays through
