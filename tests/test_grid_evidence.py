@@ -121,8 +121,10 @@ def test_a_voxel_is_reached_unless_it_is_hidden_or_no_ray_has_met_it():
         (-5, 20, 0, False),  # hidden by a new surface
         (0, 1, 0, False),  # one return is no surface
         (0, 2, 0, True),
-        (0, 4, 4, True),
-        (0, 4, 5, False),  # noise behind a surface
+        (0, 2, 2, True),
+        (0, 2, 3, False),  # noise behind a surface
+        (0, 4, 6, True),
+        (0, 4, 7, False),
         (2, 2, 100, False),
     ],
 )

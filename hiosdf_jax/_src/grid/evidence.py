@@ -23,9 +23,9 @@ _ROUNDING = 1.0007
 # ends of rays too far away.
 FREE_RATIO = 0.1
 
-# It holds an observed surface with this many hits per such ray, beside `min_hits`. Fewer are noise
-# behind a surface or returns past an edge. With 0.1, twice as many sign changes lie far from any
-# surface.
+# It holds an observed surface with this many hits per such ray, beside `min_hits` - 1. Fewer are
+# noise behind a surface or returns past an edge. With 0.1, twice as many sign changes lie far from
+# any surface.
 _SURFACE_RATIO = 0.5
 
 
@@ -216,7 +216,8 @@ def is_observed[A: (jax.Array, np.ndarray)](config: Config, passes: A, hits: A, 
     Returns:
         (...) bool.
     """
-    surface = hits >= config.min_hits + _SURFACE_RATIO * behind
+    more = config.min_hits - 1 + _SURFACE_RATIO * behind
+    surface = (hits >= config.min_hits) & (hits >= more)
     return (passes >= 0) & (is_free(passes, behind) | surface)
 
 
