@@ -22,7 +22,7 @@ from voxels import (
     update_frontier,
 )
 
-from hiosdf_jax._src.grid import evidence, interpolation, lookup, patches
+from hiosdf_jax._src.grid import distance, evidence, interpolation, lookup
 from hiosdf_jax._src.numerics import devices
 from hiosdf_jax._src.numerics.vectors import split
 from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side, surface_of
@@ -169,16 +169,10 @@ def test_distance_against_a_slow_reference(room, seen):
 def test_distance_is_about_that_to_the_nearest_of_all_patches(room):
     """The mean of the patches around a point is near the least distance, also where walls have
     gaps, and never much farther."""
-    cells = np.argwhere(
-        patches.is_feature(
-            CONFIG,
-            room.evidence.hits,
-            room.evidence.passes,
-            room.evidence.root_weight.astype(jnp.float32) ** 2,
-            room.evidence.axes,
-        )
-        & ~patches.is_behind_surface(room.evidence.hits, room.evidence.passes, room.evidence.behind)
-    )
+    kept = room.evidence
+    arrays = (kept.hits, kept.passes, kept.behind, kept.root_weight, kept.axes)
+    arrays = (jnp.asarray(array, jnp.float32) for array in arrays)
+    cells = np.argwhere(distance.find_sites(CONFIG, *arrays)[0])
     points, known = uniform(12, 100), jax.tree.map(np.asarray, room)
     exact = np.array(
         [

@@ -15,7 +15,7 @@ from benchmarks.speed import baselines, limits
 from benchmarks.speed.rows import Measured, time_ms
 from benchmarks.speed.setup import Frame
 from hiosdf_jax._src.config import Config
-from hiosdf_jax._src.grid import evidence, geometry, patches
+from hiosdf_jax._src.grid import distance, evidence, geometry
 from hiosdf_jax._src.grid.windows import RayBox, Window, box_of_rays, place_windows
 from hiosdf_jax._src.mapping import pipeline
 from hiosdf_jax._src.mapping.stages import STAGES, Step, begin
@@ -126,13 +126,12 @@ def _searched(config: Config, box: RayBox, horizon_voxels: int) -> Window:
 
 def _sites(config: Config, known: Evidence, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """The voxels that the two searches of the distance transform look for."""
-    hits, passes, behind, root_weight, axes = (
+    arrays = (
         geometry.read_window(array, window.start, window.shape).astype(jnp.float32)
         for array in (known.hits, known.passes, known.behind, known.root_weight, known.axes)
     )
-    features = patches.is_feature(config, hits, passes, root_weight**2, axes)
-    features &= ~patches.is_behind_surface(hits, passes, behind)
-    return np.asarray(features), np.asarray(patches.is_doubtful(hits, passes))
+    features, doubtful = np.asarray(distance.find_sites(config, *arrays))
+    return features, doubtful
 
 
 def _observed(config: Config, known: Evidence, window: Window) -> np.ndarray:

@@ -74,6 +74,32 @@ def recompute_distances(config: Config, grid: Grid) -> Grid:
     return grid.replace(derived=_distances_in(config, grid, whole_grid(config)))
 
 
+def find_sites(
+    config: Config,
+    hits: jax.Array,
+    passes: jax.Array,
+    behind: jax.Array,
+    root_weight: jax.Array,
+    axes: jax.Array,
+) -> jax.Array:
+    """Finds the voxels with a surface patch, and those that may hold a surface.
+
+    Args:
+        config: The map's configuration.
+        hits: Rays that ended in each voxel, (X, Y, Z) float32.
+        passes: Rays that went through it, float32.
+        behind: Rays that ended a little before it, float32.
+        root_weight: As in `Evidence`, float32.
+        axes: As in `Evidence`, (X, Y, Z, 3, 3).
+
+    Returns:
+        Both masks, (2, X, Y, Z) bool.
+    """
+    features = patches.is_feature(config, hits, passes, root_weight**2, axes)
+    features &= ~patches.is_behind_surface(hits, passes, behind)
+    return jnp.stack([features, patches.is_doubtful(hits, passes)])
+
+
 def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     """Recomputes the distances in a window that holds all that they depend on."""
     start, shape, inner_start, inner = window
@@ -95,10 +121,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
         x.astype(jnp.float32) for x in (hits, passes, behind, root_weight)
     )
     order = axis_order(config)
-    features = patches.is_feature(config, hits, passes, root_weight**2, axes)
-    features &= ~patches.is_behind_surface(hits, passes, behind)
-    doubtful = patches.is_doubtful(hits, passes)
-    sites = jnp.stack([features, doubtful])
+    sites = find_sites(config, hits, passes, behind, root_weight, axes)
     horizon = config.horizon_voxels
     indices, squares = nearest_sites(sites, mean, horizon, larger, order)
     inside = tuple(a - b for a, b in zip(within, larger.start, strict=True))
