@@ -11,7 +11,7 @@ from room import CONFIG, HALF, LARGER_BOUNDS, map_of_room
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import blend
 from hiosdf_jax._src.grid import interpolation, lookup
-from hiosdf_jax._src.state.pytrees import surface_of
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side, surface_of
 
 grid_sdf = jax.jit(lookup.grid_sdf, static_argnums=0)
 doubt_distance = jax.jit(interpolation.doubt_distance, static_argnums=0)
@@ -76,6 +76,47 @@ def test_the_papers_map_is_the_network_alone(field):
     points = jnp.asarray(points_inside())
     network = network_sdf(paper, points)
     np.testing.assert_allclose(hio.sdf(paper, points), network, atol=1e-6)
+
+
+def test_in_observed_space_the_sign_changes_only_near_patches(room_map):
+    """Also where rays contradict each other: here each voxel's side is random."""
+    derived = room_map.grid.derived
+    shape, sides = derived.side.shape, [Side.BEHIND, Side.FREE]
+    side = np.random.default_rng(1).choice(sides, shape).astype(np.int8)
+    steps = jnp.full_like(derived.frontier_steps, 5)
+    derived = derived.replace(side=jnp.asarray(side), frontier_steps=steps)
+    field = hio.snapshot(room_map.replace(grid=room_map.grid.replace(derived=derived)))
+    start = np.random.default_rng(2).uniform(-HALF, HALF, (200_000, 3)).astype(np.float32)
+    turn = np.random.default_rng(3).normal(size=start.shape)
+    end = start + 0.0025 * turn / np.linalg.norm(turn, axis=1, keepdims=True)
+    sdf = jax.jit(hio.sdf)
+    flips = np.flatnonzero((sdf(field, start) < 0) != (sdf(field, end) < 0))
+    start, end = start[flips], end[flips].astype(np.float32)
+    seen = np.asarray(hio.query(field, start).observed & hio.query(field, end).observed)
+    away = distance_to_patches(room_map.grid, start)
+    assert seen.sum() > 20
+    assert (away[seen] < 0.05 + 0.0025).all()
+    assert (away[~seen] > 0.06).sum() > 1000
+
+
+def distance_to_patches(grid, points_world):
+    """Distances of points from the nearest of all rectangles, (N,) m, float64."""
+    nearest = np.asarray(grid.derived.nearest, int)
+    known = np.argwhere(nearest[..., 0] != NO_FEATURE)
+    sites = np.unique(known + nearest[tuple(known.T)], axis=0)
+    mean, axes = (
+        np.asarray(array, float)[tuple(sites.T)]
+        for array in (grid.evidence.mean, grid.evidence.axes)
+    )
+    offset = (np.asarray(points_world, float) / 0.1 - CONFIG.corner_index)[:, None] - sites - 0.5
+    inside = offset
+    offset = offset - mean
+    for axis in (0, 1):
+        half = 0.9 * 3**0.5 * axes[:, axis]
+        share = np.sum(offset * half, axis=-1) / np.sum(half * half, axis=-1)
+        offset = offset - np.clip(share, -1, 1)[..., None] * half
+    at = np.clip(inside - offset, -0.6, 0.6)
+    return 0.1 * np.linalg.norm(inside - at, axis=-1).min(axis=1)
 
 
 def test_lower_is_below_and_by_more_where_grid_and_network_disagree(field):

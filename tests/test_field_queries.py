@@ -206,7 +206,8 @@ def test_unseen_space_is_an_obstacle_on_request(room_map):
     assert min(np.mean(deep == 0), np.mean((deep > 0) & (deep < 1)), np.mean(deep == 1)) > 0.05
     expected = (1 - deep) * expected + deep * frontier
     np.testing.assert_allclose(solid.sdf, expected, atol=1e-5)
-    assert (np.asarray(solid.sdf)[~np.asarray(solid.observed)] <= 0).all()
+    assert (np.asarray(solid.sdf)[frontier <= 0] <= 0).all()
+    assert (np.asarray(solid.sdf)[~np.asarray(solid.observed)] < 0.01).all()
     assert 0.2 < np.mean(np.asarray(plain.sdf) > plain.frontier) < 0.98
     np.testing.assert_array_equal(solid.frontier, plain.frontier)
     np.testing.assert_array_equal(solid.lower, plain.lower)
@@ -241,7 +242,7 @@ def test_deep_in_unseen_space_only_the_frontier_counts(room_map):
 def test_the_lower_bound_of_unseen_space_is_at_most_the_frontier(room_map):
     points = np.random.default_rng(3).uniform(-1.4, 1.4, (2000, 3)).astype(np.float32)
     answer = hio.query(room_map, points)
-    unseen = ~np.asarray(answer.observed)
+    unseen = np.asarray(answer.frontier) <= 0
     assert 0.2 < unseen.mean() < 0.9
     lower, frontier = np.asarray(answer.lower), np.asarray(answer.frontier)
     assert (lower[unseen] <= frontier[unseen] + 1e-6).all()

@@ -5,7 +5,8 @@ Beyond the grid's horizon the answer fades to that of the network. It also does 
 where the grid guesses the side of a surface and the guess may jump. Where unseen space is an
 obstacle, it fades to the frontier there.
 
-`lattice` has the same four functions for a baked field: `bounds`, `sdf`, `frontier`, `lower`.
+`lattice` has the same functions for a baked field: `bounds`, `sdf`, `frontier`, `observed`,
+`lower`.
 """
 
 from __future__ import annotations
@@ -33,6 +34,14 @@ _LARGEST_CORRECTION_VOXELS = 1.0
 # So near to a surface the grid answers alone, voxels. Otherwise the network lifts the distance at
 # thin things.
 _SURFACE_VOXELS = 0.2
+
+# Where rays contradict each other about free space, the sign may change without a surface: all
+# patches are farther than this, voxels, and the grid's distance is near 0, i.e. below the voxels or
+# the share of the distance to the patches. Such points do not count as observed. They are 0.06 % of
+# the observed space of house_depth.
+_NO_SURFACE_VOXELS = 0.45
+_NEAR_ZERO_VOXELS = 0.1
+_NEAR_ZERO_SHARE = 0.2
 
 # Terms of the error scale, beside the spread of the hits. Measured over a depth and a LiDAR stream:
 # the bound that holds for 99 % of the points varies least between the two, and is smallest.
@@ -86,6 +95,24 @@ def frontier(field: Field, points_world: jax.Array) -> jax.Array:
         (...) m. Differentiable.
     """
     return interpolation.frontier_distance(field.config, field.surface, points_world)
+
+
+def observed(field: Field, points_world: jax.Array) -> jax.Array:
+    """Returns a mask of the points whose side of a surface rays have shown.
+
+    Args:
+        field: The field.
+        points_world: (..., 3) m, inside the bounds.
+
+    Returns:
+        (...) bool.
+    """
+    config = field.config
+    nearest = lookup.nearest_patch(config, field.surface, points_world)
+    share = _NEAR_ZERO_SHARE * jnp.minimum(nearest.distance, config.distance_horizon)
+    near_zero = jnp.abs(nearest.sdf) < jnp.maximum(_NEAR_ZERO_VOXELS * config.voxel_size, share)
+    contradicted = near_zero & (nearest.plane > _NO_SURFACE_VOXELS * config.voxel_size)
+    return (frontier(field, points_world) > 0) & ~contradicted
 
 
 def lower(field: Field, points_world: jax.Array) -> jax.Array:

@@ -1,6 +1,6 @@
 """Answers of a baked field: samples on a regular lattice, interpolated trilinearly.
 
-`blend` has the same four functions for a live map: `bounds`, `sdf`, `frontier`, `lower`.
+`blend` has the same functions for a live map: `bounds`, `sdf`, `frontier`, `observed`, `lower`.
 """
 
 from __future__ import annotations
@@ -35,6 +35,11 @@ def sdf(baked: Baked, points_world: jax.Array, unknown: Unknown) -> jax.Array:
 def frontier(baked: Baked, points_world: jax.Array) -> jax.Array:
     """Interpolates the distance to unseen space at points (..., 3) m inside the box; (...) m."""
     return interpolate(baked, baked.frontier, points_world)
+
+
+def observed(baked: Baked, points_world: jax.Array) -> jax.Array:
+    """Returns a mask of the points (..., 3) m inside the box before the frontier; (...) bool."""
+    return frontier(baked, points_world) > 0
 
 
 def lower(baked: Baked, points_world: jax.Array) -> jax.Array:

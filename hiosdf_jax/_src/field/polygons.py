@@ -11,14 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hiosdf_jax._src.grid.patches import LEAST_WIDTH
 from hiosdf_jax._src.state.pytrees import NO_FEATURE, Surface
 
 # A polygon covers this many standard deviations of the hits to each side, along each axis of the
 # grid. Hits that cover a rectangle evenly reach 1.7; more draws surfaces beyond edges.
 _EXTENT_DEVIATIONS = 1.5
-
-# Two hits span no plane: the second axis is rounding noise where it is shorter, voxels.
-_LEAST_WIDTH = 3e-3
 
 # A neighbor continues a surface where its plane passes this near, voxels: more leaves fewer holes
 # around small things, and draws more that is not there. The surface must also head for it: at
@@ -91,7 +89,7 @@ def find_patches(surface: Surface) -> Patches:
     known = np.argwhere(nearest[..., 0] != NO_FEATURE)
     used = np.zeros(nearest.shape[:3], bool)
     used[tuple((known + nearest[tuple(known.T)]).T)] = True
-    used &= np.linalg.norm(axes[..., 1, :].astype(np.float32), axis=-1) > _LEAST_WIDTH
+    used &= np.linalg.norm(axes[..., 1, :].astype(np.float32), axis=-1) > LEAST_WIDTH
     index = np.argwhere(used)
     mean, axes = (array[used].astype(float) for array in (mean, axes))
     normal = unit(np.cross(axes[:, 0], axes[:, 1]))

@@ -195,10 +195,12 @@ def _queries(unknown: Unknown) -> Evaluate:
 
 
 def _all_answers(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
-    frontier = _frontier(field, _place(field, points))
+    place = _place(field, points)
+    observed = (place.beyond <= 0) & _answers_of(field).observed(field, place.nearest)
+    frontier = _frontier(field, place)
     sdf, grad = _with_gradient(field, points, unknown, "sdf")
     lower, lower_grad = _with_gradient(field, points, "network", "lower")
-    return Query(sdf, grad, frontier > 0, frontier, lower, lower_grad)
+    return Query(sdf, grad, observed, frontier, lower, lower_grad)
 
 
 def _with_gradient(

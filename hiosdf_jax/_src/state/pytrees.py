@@ -289,10 +289,11 @@ class Query(NamedTuple):
     Attributes:
         sdf: Signed distance under the chosen policy for unseen space, (...) float32, m.
         grad: d(sdf)/d(point), (..., 3) float32.
-        observed: Whether rays have shown the voxel that contains the point to be free or to hold a
-            surface, (...) bool.
-        frontier: Distance to the nearest voxel that is not observed, (...) float32, m; not
-            positive in such voxels.
+        observed: Whether rays have shown on which side of a surface the point lies, (...) bool: its
+            voxel was seen to be free or to hold a surface, and rays do not contradict each other
+            there. Of a baked field, whether `frontier` is positive.
+        frontier: Distance to the nearest voxel that was not seen, (...) float32, m; not positive in
+            such voxels.
         lower: At most the true distance at about 99 % of the points on a sensor's rays, (...)
             float32, m. It is calibrated on each new cloud, not guaranteed. It is negative in unseen
             space. In observed space a surface that no ray has met may be nearer: the least of
