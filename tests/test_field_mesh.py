@@ -33,6 +33,9 @@ def field_of(points, toward):
         size, direction = np.sqrt(np.maximum(size[::-1], 1e-6)), direction.T[::-1]
         ahead = np.asarray(toward) - (own.mean(axis=0) + voxel + config.corner_index + 0.5) * VOXEL
         normal = direction[2] * (1 if direction[2] @ ahead >= 0 else -1)
+        if size[1] < 2e-3:  # on a line: perpendicular to it, toward the sensor
+            across = ahead - (ahead @ direction[0]) * direction[0]
+            normal = across / np.linalg.norm(across)
         axes[voxel] = size[:, None] * [direction[0], np.cross(normal, direction[0]), normal]
         nearest[voxel], mean[voxel] = 0, own.mean(axis=0)
     field = hio.snapshot(hio.init(config, jax.random.key(0)))
@@ -65,11 +68,19 @@ def square(seed, turn, center, half=0.6, count=60_000):
     return center + uv @ turn[:, :2].T
 
 
+def with_planes(points):
+    """Leaves out the points in voxels with so few that they may lie on a line."""
+    voxel = np.floor(points / VOXEL).astype(int)
+    _, row, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    return points[count[row.ravel()] >= 5]
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_square_is_one_flat_piece_without_holes(seed):
     turn = np.eye(3) if seed == 0 else rotation(seed)
     center = np.array([0.03, -0.02, 0.04])
-    found = extract_mesh(field_of(square(seed, turn, center), center + turn[:, 2]))
+    points = with_planes(square(seed, turn, center))
+    found = extract_mesh(field_of(points, center + turn[:, 2]))
     local = (found.vertices - center) @ turn
     # Means and axes are stored with 11 bits.
     assert np.abs(local[:, 2]).max() < 1e-3
@@ -151,6 +162,12 @@ def test_the_triangles_of_a_plane_have_common_vertices():
     field = field_of(square(3, turn, 0.0), turn[:, 2])
     vertex, normal, face = polygons.triangulate(field.surface)
     found = trimesh.Trimesh(vertex, face, process=False)
+    pieces = trimesh.graph.connected_components(
+        found.face_adjacency, min_len=1, nodes=np.arange(len(found.faces))
+    )
+    # Without the strips of two hits.
+    pieces = [piece for piece in pieces if found.area_faces[piece].sum() > 0.01]
+    found.update_faces(np.concatenate(pieces))
     local = (found.vertices * VOXEL + np.array(field.config.corner_index) * VOXEL) @ turn
     border = found.edges[trimesh.grouping.group_rows(found.edges_sorted, require_count=1)]
     inner = np.abs(local[border].mean(axis=1)[:, :2]).max(axis=1) < 0.45
@@ -198,10 +215,33 @@ def test_polygons_are_the_cuts_of_planes_with_boxes(seed):
         assert (around @ normal[k] > -1e-12).all()
 
 
-def test_hits_without_a_plane_have_no_surface():
+def test_hits_on_a_line_are_a_narrow_strip_that_faces_the_sensor():
     line = np.stack([np.linspace(0.01, 0.09, 50), np.full(50, 0.03), np.full(50, 0.05)], axis=1)
-    for points in (line, line[:1], line[:2]):
-        assert len(extract_mesh(field_of(points, (0, 0, 1))).faces) == 0
+    toward = np.array([0.05, 0.4, 1.0])
+    for points in (line, line[::49], line[20:30]):
+        found = extract_mesh(field_of(points, toward))
+        ahead = (toward - points.mean(axis=0)) * (0, 1, 1)
+        np.testing.assert_allclose(found.vertex_normals @ ahead, np.linalg.norm(ahead), rtol=1e-3)
+        low, high = found.bounds
+        assert (high - low)[0] == pytest.approx(min(3 * points[:, 0].std(), VOXEL), abs=2e-3)
+        assert np.linalg.norm((high - low)[1:]) == pytest.approx(3 * 3e-3 * VOXEL, rel=0.1)
+        np.testing.assert_allclose((low + high) / 2, points.mean(axis=0), atol=1e-3)
+
+
+def test_a_hit_alone_has_no_surface():
+    assert len(extract_mesh(field_of(np.full((1, 3), 0.03), (0, 0, 1))).faces) == 0
+
+
+def test_a_strip_beside_a_plane_leaves_it_as_it_is():
+    """Its own plane is not known, so neither continues the other."""
+    plane = square(0, np.eye(3), np.array([0.0, 0.0, 0.05]), half=0.3)
+    line = np.array([[0.31, 0.05, 0.05], [0.39, 0.05, 0.06]])
+    alone, both = (
+        extract_mesh(field_of(points, (0.0, 0.0, 1.0)))
+        for points in (plane, np.concatenate([plane, line]))
+    )
+    assert len(both.faces) > len(alone.faces)
+    assert both.area == pytest.approx(alone.area, rel=1e-3)
 
 
 @pytest.mark.parametrize("resolution", [1.0, 0.1, 0.05, 0.025])

@@ -11,12 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.grid.patches import LEAST_WIDTH
 from hiosdf_jax._src.state.pytrees import NO_FEATURE, Surface
 
 # A polygon covers this many standard deviations of the hits to each side, along each axis of the
 # grid. Hits that cover a rectangle evenly reach 1.7; more draws surfaces beyond edges.
 _EXTENT_DEVIATIONS = 1.5
+
+# Two hits span no plane: the second axis is rounding noise where it is shorter, voxels. They become
+# a strip that faces the sensor, with this deviation across. No neighbor continues it, since the
+# plane of the surface is unknown. A single hit has no extent.
+_LEAST_WIDTH = 3e-3
 
 # A neighbor continues a surface where its plane passes this near, voxels: more leaves fewer holes
 # around small things, and draws more that is not there. The surface must also head for it: at
@@ -33,7 +37,7 @@ _ON_GRID = 1e-6  # voxels
 
 
 class Patches(NamedTuple):
-    """The patches that have a plane, in voxels from the corner of the grid.
+    """The patches that queries use, in voxels from the corner of the grid.
 
     Attributes:
         center: Mean of the hits, (M, 3).
@@ -82,19 +86,22 @@ def triangulate(surface: Surface) -> Triangles:
 
 
 def find_patches(surface: Surface) -> Patches:
-    """Finds the patches that queries use and that have a plane, and where their polygons end."""
+    """Finds the patches that queries use, and where their polygons end."""
     nearest, mean, axes = (
         np.asarray(array) for array in (surface.derived.nearest, surface.mean, surface.axes)
     )
     known = np.argwhere(nearest[..., 0] != NO_FEATURE)
     used = np.zeros(nearest.shape[:3], bool)
     used[tuple((known + nearest[tuple(known.T)]).T)] = True
-    used &= np.linalg.norm(axes[..., 1, :].astype(np.float32), axis=-1) > LEAST_WIDTH
+    used &= np.linalg.norm(axes[..., 0, :].astype(np.float32), axis=-1) > _LEAST_WIDTH
     index = np.argwhere(used)
     mean, axes = (array[used].astype(float) for array in (mean, axes))
     normal = unit(np.cross(axes[:, 0], axes[:, 1]))
+    width = np.linalg.norm(axes[:, 1], axis=-1)
+    has_plane = width > _LEAST_WIDTH
+    axes[:, 1] *= np.maximum(_LEAST_WIDTH / np.maximum(width, 1e-9), 1)[:, None]
     row = np.full(used.shape, -1)
-    row[used] = np.arange(len(index))
+    row[used] = np.where(has_plane, np.arange(len(index)), -1)
 
     # The faces of the voxel, and the borders of the surface, which may cross them.
     middle = unit(axes[:, 1])
@@ -106,7 +113,8 @@ def find_patches(surface: Surface) -> Patches:
     )
     limit = np.minimum(reach, end)
     for k, side in enumerate(direction):
-        limit[k] = np.where(_continues(row, index, mean, normal, side), end[k], limit[k])
+        continues = has_plane & _continues(row, index, mean, normal, side)
+        limit[k] = np.where(continues, end[k], limit[k])
     # Across its plane a polygon would be cut by its slope.
     each, steepest = np.arange(len(index)), np.argmax(np.abs(normal), axis=-1)
     for face in (steepest, steepest + 3):

@@ -59,13 +59,11 @@ class Nearest(NamedTuple):
         sdf: Signed distance to the patches, (...) m; the horizon where none is within it.
         spread: Standard deviation of the patches' hits along their normals, (...) m; 0 without one.
         distance: To the nearest patch, (...) m; infinite without one.
-        plane: Distance to the nearest patch that spans a plane, (...) m; infinite without one.
     """
 
     sdf: jax.Array
     spread: jax.Array
     distance: jax.Array
-    plane: jax.Array
 
 
 def nearest_patch(config: Config, surface: Surface, points_world: jax.Array) -> Nearest:
@@ -110,8 +108,7 @@ def nearest_patch_at(
     value = jnp.where(found, value, 0)
 
     # It cancels from the means, and so does its derivative.
-    fixed = jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf))
-    least = jnp.min(fixed, axis=0)
+    least = jnp.min(jax.lax.stop_gradient(jnp.where(found, distance, jnp.inf)), axis=0)
     any_found = least < jnp.inf
     # Not by a minimum: at the nearest patch it would halve the derivative.
     lag = jnp.where(found, distance - least, 0) / _SOFT_VOXELS
@@ -121,9 +118,7 @@ def nearest_patch_at(
     sdf = _mean_with_softer_sign(weight, share, lag, distance, value)
     spread = jnp.sum(weight * patch.spread, axis=0)
     sdf_m = jnp.where(any_found, sdf * config.voxel_size, config.distance_horizon)
-    plane = jnp.min(jnp.where(patch.width > patches.LEAST_WIDTH, fixed, jnp.inf), axis=0)
-    spread, least, plane = (x * config.voxel_size for x in (spread, least, plane))
-    return Nearest(sdf_m, spread, least, plane)
+    return Nearest(sdf_m, spread * config.voxel_size, least * config.voxel_size)
 
 
 def _mean_with_softer_sign(

@@ -47,9 +47,6 @@ _LEAST_DIRECTED = 2e-3
 
 _JACOBI_SWEEPS = 5
 
-LEAST_WIDTH = 3e-3
-"""A patch spans a plane if its second axis is longer, voxels. That of two hits is noise."""
-
 # Eigenvalues closer than this share of the largest one are rounding, to derivatives.
 _LEAST_GAP = 1e-6
 
