@@ -51,7 +51,7 @@ _JACOBI_SWEEPS = 5
 _LEAST_GAP = 1e-6
 
 # Smaller patches (voxels^2) need as many hits as a patch of this area: stray returns are small too.
-_LEAST_AREA = 0.2
+_LEAST_AREA = 0.18
 
 # A patch below this area (voxels^2) needs this share of that if its returns are sharp: noise did
 # not put them beside their surface. Their standard deviation is at most this many voxels, and they
