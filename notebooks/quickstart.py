@@ -105,7 +105,8 @@ plt.show()
 
 # %% [markdown]
 # ## Unseen space
-# `observed` is False where no ray has reached, and the distance there is a guess of the network.
+# `observed` is False where no ray has reached, and the distance there is a guess of the network. It
+# is also False at a few points where rays contradict each other.
 # `unknown="obstacle"` makes unseen space solid, which is what a planner wants.
 
 # %%

@@ -93,6 +93,9 @@ def test_in_observed_space_the_sign_changes_only_near_patches(room_map):
     flips = np.flatnonzero((sdf(field, start) < 0) != (sdf(field, end) < 0))
     start, end = start[flips], end[flips].astype(np.float32)
     seen = np.asarray(hio.query(field, start).observed & hio.query(field, end).observed)
+    paper = field.replace(config=dataclasses.replace(CONFIG, grid_share=0.0))
+    same = hio.query(paper, start).observed == hio.query(field, start).observed
+    assert np.asarray(same).all()  # the grid decides also where the network answers
     away = distance_to_patches(room_map.grid, start)
     assert seen.sum() > 20
     assert (away[seen] < 0.05 + 0.0025).all()

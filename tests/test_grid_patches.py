@@ -214,6 +214,13 @@ def test_small_patches_of_sharp_returns_need_fewer_hits(half, sigma_voxels, shar
         assert bool(kept) == expected
 
 
+@pytest.mark.parametrize(("hits", "kept"), [(4.4, False), (4.6, True)])
+def test_however_small_a_patch_needs_nine_of_two_hundred_rays(hits, kept):
+    axes = jnp.diag(jnp.array([0.19, 0.04, 0.03]))  # a handle in the demo
+    answer = patches.is_feature(CONFIG, jnp.float32(hits), jnp.float32(100 - hits), 1e-3, axes)
+    assert bool(answer) == kept
+
+
 def test_few_hits_behind_many_ends_are_noise():
     hits, behind = np.meshgrid(np.arange(20.0), np.arange(0.0, 101, 5))
     for passes, share in ((0.0, 0.1), (-3.0, 0.1), (2.0, 0.03)):

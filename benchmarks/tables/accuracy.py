@@ -11,7 +11,9 @@ from benchmarks.tables.markdown import lay_out
 from hiosdf_jax.scoring import format_score
 
 _HOUSE = {"house_depth": "depth camera", "house_lidar": "LiDAR"}
+_SCENES = {"house_depth": "house, depth camera", "house_lidar": "house, LiDAR", "demo": "demo"}
 _REAL = {"kitchen_depth": "kitchen", "hall_lidar": "hall"}
+_QUANTILES = ("median_cm", "p90_cm")
 _PRESETS = ("default", "paper", "light")
 _MESHES = ("default", "light")
 
@@ -69,15 +71,32 @@ def spread() -> str:
 
 
 def real() -> str:
-    """Distances of held-out returns from the surface of the map."""
+    """Distances of held-out returns from the surface of the map, and from its mesh."""
     rows = []
-    for config in _PRESETS:
-        entries = [_figures(stream, config) for stream in _REAL]
-        means = [entry["mean"]["blended"] if entry else {} for entry in entries]
-        scores = [_score(mean, metric) for mean in means for metric in ("median_cm", "p90_cm")]
-        rows.append([f"`Config.{config}`", *scores])
-    columns = [f"{place}, {part}" for place in _REAL.values() for part in ("median", "90 % below")]
-    return lay_out(["held-out returns, cm", *columns], rows)
+    for stream, place in _REAL.items():
+        for config in _PRESETS:
+            if entry := _figures(stream, config):
+                mean = entry["mean"]["blended"]
+                cells = [
+                    " / ".join(filter(None, (_score(mean, f"{part}{m}") for m in _QUANTILES)))
+                    for part in ("", "mesh_")
+                ]
+                rows.append([f"{place}, `Config.{config}`", *cells, str(len(entry["seeds"]))])
+    columns = ["from the map", "from its mesh", "seeds"]
+    return lay_out(["held-out returns, cm: median / 90 % below", *columns], rows)
+
+
+def parts() -> str:
+    """What the grid and the network bring to the distance that is served."""
+    metrics = ("visible_cm", "thin_share", "cosine", "eikonal")
+    names = {"grid": "the grid alone", "network": "the network alone", "blended": "both, as served"}
+    rows = []
+    for stream, scene in _SCENES.items():
+        for variant, label in names.items():
+            mean = _figures(stream, "default")["mean"][variant]
+            rows.append([f"{scene}: {label}", *(_score(mean, metric) for metric in metrics)])
+    columns = ["error, cm", "thin parts", "1 - cos of the gradient", "abs(norm - 1)"]
+    return lay_out(["`Config.default`", *columns], rows)
 
 
 def ablation() -> str:
@@ -111,12 +130,13 @@ def steps() -> str:
     """How the distance changes along 2.5 mm, and gradients."""
     metrics = ("steps_ppm", "step_largest_cm", "far_flips_ppm", "cosine", "eikonal")
     rows = [
-        [f"`Config.{config}`", *(_score(_blended("house_depth", config), m) for m in metrics)]
-        for config in ("default", "light", "paper")
+        [f"{scene}, `Config.{config}`", *(_score(_blended(stream, config), m) for m in metrics)]
+        for stream, scene in _SCENES.items()
+        for config in ("default", "light")
     ]
-    columns = ["changes > 5 mm", "largest, cm", "sign changes far from surfaces, of a million"]
+    columns = ["changes > 5 mm", "largest, cm", "sign changes far from surfaces"]
     columns += ["1 - cos of the gradient", "abs(norm - 1)"]
-    return lay_out(["house, depth camera", *columns], rows)
+    return lay_out(["of a million segments", *columns], rows)
 
 
 def training() -> str:
@@ -135,6 +155,7 @@ def training() -> str:
 TABLES = {
     "accuracy": house,
     "accuracy-spread": spread,
+    "parts": parts,
     "real": real,
     "ablation": ablation,
     "mesh": mesh,

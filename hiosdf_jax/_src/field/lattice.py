@@ -38,7 +38,7 @@ def frontier(baked: Baked, points_world: jax.Array) -> jax.Array:
 
 
 def observed(baked: Baked, points_world: jax.Array) -> jax.Array:
-    """Returns a mask of the points (..., 3) m inside the box before the frontier; (...) bool."""
+    """Returns a mask of the points, (..., 3) m inside the box, whose frontier is positive."""
     return frontier(baked, points_world) > 0
 
 

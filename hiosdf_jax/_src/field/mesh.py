@@ -31,8 +31,8 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
 
     The mesh consists of the surface patches of the grid, joined along the edges of the voxels. It
     has surfaces where rays ended, and nowhere else. A sheet that was seen from both sides, such as
-    a door, is a single surface. Two returns alone in a voxel are a narrow strip. Time and memory
-    follow the surface, not the bounds.
+    a door, is a single surface. Returns on a line in a voxel, such as two alone, are a strip 1 % of
+    a voxel wide. Time and memory follow the surface, not the bounds.
 
     Args:
         field: A map or a snapshot of one. The network has no part in the mesh.

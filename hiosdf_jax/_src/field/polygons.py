@@ -17,9 +17,9 @@ from hiosdf_jax._src.state.pytrees import NO_FEATURE, Surface
 # grid. Hits that cover a rectangle evenly reach 1.7; more draws surfaces beyond edges.
 _EXTENT_DEVIATIONS = 1.5
 
-# Two hits span no plane: the second axis is rounding noise where it is shorter, voxels. They become
-# a strip that faces the sensor, with this deviation across. No neighbor continues it, since the
-# plane of the surface is unknown. A single hit has no extent.
+# A patch whose second axis is shorter, voxels, has no plane: its hits lie on a line. It becomes a
+# strip that faces the sensor, with this deviation across. Neighbors neither continue it nor are
+# continued by it. A patch whose first axis is shorter is not drawn.
 _LEAST_WIDTH = 3e-3
 
 # A neighbor continues a surface where its plane passes this near, voxels: more leaves fewer holes

@@ -51,6 +51,7 @@ _JACOBI_SWEEPS = 5
 _LEAST_GAP = 1e-6
 
 # Smaller patches (voxels^2) need as many hits as a patch of this area: stray returns are small too.
+# With 0.2, the demo loses 0.3 % more of its thin parts, and the house loses nothing.
 _LEAST_AREA = 0.18
 
 # A patch below this area (voxels^2) needs this share of that if its returns are sharp: noise did

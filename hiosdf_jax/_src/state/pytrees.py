@@ -289,9 +289,10 @@ class Query(NamedTuple):
     Attributes:
         sdf: Signed distance under the chosen policy for unseen space, (...) float32, m.
         grad: d(sdf)/d(point), (..., 3) float32.
-        observed: Whether rays have shown on which side of a surface the point lies, (...) bool: its
-            voxel was seen to be free or to hold a surface, and rays do not contradict each other
-            there. Of a baked field, whether `frontier` is positive.
+        observed: Whether the point was seen and its side of the surface is certain, (...) bool.
+            False where `frontier` is not positive, and at a few points where rays contradict each
+            other: there `sdf` is near 0 and its sign may change without a surface. Of a baked
+            field, whether `frontier` is positive.
         frontier: Distance to the nearest voxel that was not seen, (...) float32, m; not positive in
             such voxels.
         lower: At most the true distance at about 99 % of the points on a sensor's rays, (...)
