@@ -57,6 +57,13 @@ def distance_to(found, points):
     return np.sqrt(np.maximum(squared, 0))
 
 
+def distance_to_line(points, start, end):
+    """Distances of points (N, 3) to the line through two points, m."""
+    along = (end - start) / np.linalg.norm(end - start)
+    offset = points - start
+    return np.linalg.norm(offset - (offset @ along)[:, None] * along, axis=1)
+
+
 def rotation(seed):
     turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return turn * np.sign(np.linalg.det(turn))
@@ -160,7 +167,7 @@ def test_a_crease_stays_sharp():
 def test_the_triangles_of_a_plane_have_common_vertices():
     turn = rotation(3)
     field = field_of(square(3, turn, 0.0), turn[:, 2])
-    vertex, normal, face = polygons.triangulate(field.surface)
+    vertex, normal, face, _ = polygons.triangulate(field.surface)
     found = trimesh.Trimesh(vertex, face, process=False)
     pieces = trimesh.graph.connected_components(
         found.face_adjacency, min_len=1, nodes=np.arange(len(found.faces))
@@ -204,7 +211,9 @@ def test_polygons_are_the_cuts_of_planes_with_boxes(seed):
     sides = np.concatenate([np.eye(3), -np.eye(3)])
     direction = np.broadcast_to(sides[:, None], (6, 5, 3))
     limit = np.concatenate([(high - center).T, (center - low).T])
-    cut = polygons.cut_polygons(polygons.Patches(center, normal, direction, limit))
+    cut = polygons.cut_polygons(
+        polygons.Patches(center, normal, direction, limit, np.zeros(5, bool))
+    )
     for k in range(5):
         corners = cut.corner[k, : cut.count[k]]
         expected = slow_cut(center[k], normal[k], low[k], high[k])
@@ -242,6 +251,9 @@ def test_a_strip_beside_a_plane_leaves_it_as_it_is():
     )
     assert len(both.faces) > len(alone.faces)
     assert both.area == pytest.approx(alone.area, rel=1e-3)
+    strip = both.vertices[both.vertices[:, 0] > 0.302]
+    assert len(strip) >= 4
+    assert distance_to_line(strip, *line).max() < 1e-3
 
 
 @pytest.mark.parametrize("resolution", [1.0, 0.1, 0.05, 0.025])

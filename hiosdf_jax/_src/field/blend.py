@@ -35,11 +35,11 @@ _LARGEST_CORRECTION_VOXELS = 1.0
 # thin things.
 _SURFACE_VOXELS = 0.2
 
-# Where rays contradict each other about free space, the sign may change without a surface. Points
-# are not observed if all patches are farther than the first number, voxels, and the distance of the
-# grid is below the second one, voxels, or below the share of the distance to the patches. That
-# leaves out 0.07 % of house_depth. With 0.4 instead of 0.35, one sign change of a million was half
-# a voxel from the mesh.
+# Where rays contradict each other about free space, and beside the edges of some patches, the sign
+# may change without a surface. Points are not observed if all patches are farther than the first
+# number, voxels, and the distance of the grid is below the second one, voxels, or below the share
+# of the distance to the patches. That leaves out 0.07 % of house_depth. With 0.4 instead of 0.35,
+# one sign change of a million was half a voxel from the mesh.
 _NO_SURFACE_VOXELS = 0.35
 _NEAR_ZERO_VOXELS = 0.1
 _NEAR_ZERO_SHARE = 0.2

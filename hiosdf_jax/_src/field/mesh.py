@@ -58,7 +58,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     if is_traced(*jax.tree.leaves(field)):
         raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
     config, surface = field.config, field.surface
-    vertices, normals, faces = polygons.triangulate(surface)
+    vertices, normals, faces, is_strip = polygons.triangulate(surface)
     if not len(faces):
         return trimesh.Trimesh()
     halvings = max(0, math.ceil(math.log2(config.voxel_size) - math.log2(spacing) - 1e-6))
@@ -69,9 +69,9 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
             f"most {_MOST_TRIANGLES}"
         )
     for _ in range(halvings):
-        both = np.concatenate([vertices, normals], axis=-1)
-        both, faces = trimesh.remesh.subdivide(both, faces)[:2]
-        vertices, normals = both[:, :3], both[:, 3:]
+        rows = np.concatenate([vertices, normals, is_strip[:, None]], axis=-1)
+        rows, faces = trimesh.remesh.subdivide(rows, faces)[:2]
+        vertices, normals, is_strip = rows[:, :3], rows[:, 3:6], rows[:, 6] > 0
     points = ((vertices + config.corner_index) * config.voxel_size).astype(np.float32)
     normals = polygons.unit(normals).astype(np.float32)
     moved, turned = np.empty_like(points), np.empty_like(normals)
@@ -81,6 +81,8 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
         return _move(config, surface, points[row], normals[row])
 
     fill_in_chunks(move, {"points": moved, "normals": turned, "spread": spread}, _CHUNK)
+    # A strip has no plane to be averaged with others: it lies where its hits are.
+    moved[is_strip], turned[is_strip] = points[is_strip], normals[is_strip]
     return trimesh.Trimesh(
         moved,
         faces,

@@ -44,12 +44,14 @@ class Patches(NamedTuple):
         normal: Unit vectors toward the sensor's side, (M, 3).
         direction: The directions in which the polygon ends, unit vectors, (D, M, 3).
         limit: Where it ends in each direction, from the center, (D, M).
+        is_strip: The hits lie on a line, (M,) bool.
     """
 
     center: np.ndarray
     normal: np.ndarray
     direction: np.ndarray
     limit: np.ndarray
+    is_strip: np.ndarray
 
 
 class Polygons(NamedTuple):
@@ -71,18 +73,20 @@ class Triangles(NamedTuple):
         vertex: (V, 3).
         normal: Unit vectors toward the sensor's side, (V, 3).
         face: Rows of vertices, counterclockwise around the normal, (F, 3).
+        is_strip: The vertex belongs to a strip, (V,) bool.
     """
 
     vertex: np.ndarray
     normal: np.ndarray
     face: np.ndarray
+    is_strip: np.ndarray
 
 
 def triangulate(surface: Surface) -> Triangles:
     """Triangulates the patches of a surface."""
     patches = find_patches(surface)
     polygons = cut_polygons(patches)
-    return join_corners(polygons, patches.normal)
+    return join_corners(polygons, patches.normal, patches.is_strip)
 
 
 def find_patches(surface: Surface) -> Patches:
@@ -98,10 +102,10 @@ def find_patches(surface: Surface) -> Patches:
     mean, axes = (array[used].astype(float) for array in (mean, axes))
     normal = unit(np.cross(axes[:, 0], axes[:, 1]))
     width = np.linalg.norm(axes[:, 1], axis=-1)
-    has_plane = width > _LEAST_WIDTH
+    is_strip = width <= _LEAST_WIDTH
     axes[:, 1] *= np.maximum(_LEAST_WIDTH / np.maximum(width, 1e-9), 1)[:, None]
     row = np.full(used.shape, -1)
-    row[used] = np.where(has_plane, np.arange(len(index)), -1)
+    row[used] = np.where(is_strip, -1, np.arange(len(index)))
 
     # The faces of the voxel, and the borders of the surface, which may cross them.
     middle = unit(axes[:, 1])
@@ -113,13 +117,13 @@ def find_patches(surface: Surface) -> Patches:
     )
     limit = np.minimum(reach, end)
     for k, side in enumerate(direction):
-        continues = has_plane & _continues(row, index, mean, normal, side)
+        continues = ~is_strip & _continues(row, index, mean, normal, side)
         limit[k] = np.where(continues, end[k], limit[k])
     # Across its plane a polygon would be cut by its slope.
     each, steepest = np.arange(len(index)), np.argmax(np.abs(normal), axis=-1)
     for face in (steepest, steepest + 3):
         limit[face, each] = end[face, each]
-    return Patches(index + 0.5 + mean, normal, direction, limit)
+    return Patches(index + 0.5 + mean, normal, direction, limit, is_strip)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -207,23 +211,24 @@ def _clip(polygons: Polygons, direction: np.ndarray, limit: np.ndarray) -> Polyg
     return Polygons(result, added.sum(axis=1))
 
 
-def join_corners(polygons: Polygons, normal: np.ndarray) -> Triangles:
+def join_corners(polygons: Polygons, normal: np.ndarray, is_strip: np.ndarray) -> Triangles:
     """Triangulates polygons and joins the corners that they have on the edges of the grid.
 
     Args:
         polygons: M polygons.
         normal: Their normals, (M, 3).
+        is_strip: Their corners stay alone, (M,) bool.
 
     Returns:
         The triangles, without those that the joining made empty or equal.
     """
     count = polygons.count
     row, place = np.nonzero(np.arange(polygons.corner.shape[1]) < count[:, None])
-    corner, normal = polygons.corner[row, place], normal[row]
-    vertex_of, vertex = _join(corner, normal)
+    corner, normal, is_strip = polygons.corner[row, place], normal[row], is_strip[row]
+    vertex_of, vertex = _join(corner, normal, is_strip)
     # The sides of a sheet face away from each other.
-    _, some = np.unique(vertex_of, return_index=True)
-    sign = np.where(np.sum(normal * normal[some][vertex_of], axis=-1) < 0, -1.0, 1.0)
+    _, first = np.unique(vertex_of, return_index=True)
+    sign = np.where(np.sum(normal * normal[first][vertex_of], axis=-1) < 0, -1.0, 1.0)
     total = _sum_of_rows(sign[:, None] * normal, vertex_of, len(vertex))
     total = unit(total)
 
@@ -234,15 +239,18 @@ def join_corners(polygons: Polygons, normal: np.ndarray) -> Triangles:
     full = (face[:, 0] != face[:, 1]) & (face[:, 1] != face[:, 2]) & (face[:, 2] != face[:, 0])
     face = face[full]
     _, some = np.unique(np.sort(face, axis=1), axis=0, return_index=True)
-    return Triangles(vertex, total, face[np.sort(some)])
+    return Triangles(vertex, total, face[np.sort(some)], is_strip[first])
 
 
-def _join(corner: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _join(
+    corner: np.ndarray, normal: np.ndarray, is_strip: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Finds the corners that become one vertex.
 
     Args:
         corner: (N, 3) voxels.
         normal: (N, 3).
+        is_strip: The corner stays alone, (N,) bool.
 
     Returns:
         The vertex of each corner, (N,), and the vertices, (V, 3).
@@ -253,7 +261,7 @@ def _join(corner: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarra
     # at a corner of the grid, along the normal.
     loose = np.where(on_grid, -1.0, 1.0) + 0.1 * np.abs(normal)
     axis = np.argmax(loose, axis=-1)
-    on_edge = on_grid.sum(axis=-1) >= 2
+    on_edge = (on_grid.sum(axis=-1) >= 2) & ~is_strip
     others = (axis[:, None] + [1, 2]) % 3
     line = np.take_along_axis(nearest, others, axis=1)
     line = np.where(on_edge[:, None], line, [-1, -1])

@@ -290,9 +290,9 @@ class Query(NamedTuple):
         sdf: Signed distance under the chosen policy for unseen space, (...) float32, m.
         grad: d(sdf)/d(point), (..., 3) float32.
         observed: Whether the point was seen and its side of the surface is certain, (...) bool.
-            False where `frontier` is not positive, and at a few points where rays contradict each
-            other: there `sdf` is near 0 and its sign may change without a surface. Of a baked
-            field, whether `frontier` is positive.
+            False where `frontier` is not positive, and at a few points where `sdf` is near 0
+            although no surface is, mostly because rays contradict each other. Of a baked field,
+            whether `frontier` is positive.
         frontier: Distance to the nearest voxel that was not seen, (...) float32, m; not positive in
             such voxels.
         lower: At most the true distance at about 99 % of the points on a sensor's rays, (...)
