@@ -5,7 +5,7 @@ Beyond the grid's horizon the answer fades to that of the network. It also does 
 where the grid guesses the side of a surface and the guess may jump. Where unseen space is an
 obstacle, it fades to the frontier there.
 
-`lattice` has the same functions for a baked field: `bounds`, `sdf`, `frontier`, `observed`,
+`lattice` has the same functions for a baked field: `bounds`, `sdf`, `frontier`, `is_certain`,
 `lower`.
 """
 
@@ -98,8 +98,8 @@ def frontier(field: Field, points_world: jax.Array) -> jax.Array:
     return interpolation.frontier_distance(field.config, field.surface, points_world)
 
 
-def observed(field: Field, points_world: jax.Array) -> jax.Array:
-    """Returns a mask of the points that were seen, and whose sign is certain.
+def is_certain(field: Field, points_world: jax.Array) -> jax.Array:
+    """Returns a mask of the points whose sign is certain.
 
     Args:
         field: The field.
@@ -113,8 +113,7 @@ def observed(field: Field, points_world: jax.Array) -> jax.Array:
     # Without a patch the distance is infinite.
     share = _NEAR_ZERO_SHARE * jnp.minimum(nearest.distance, config.distance_horizon)
     near_zero = jnp.abs(nearest.sdf) < jnp.maximum(_NEAR_ZERO_VOXELS * config.voxel_size, share)
-    contradicted = near_zero & (nearest.distance > _NO_SURFACE_VOXELS * config.voxel_size)
-    return (frontier(field, points_world) > 0) & ~contradicted
+    return ~near_zero | (nearest.distance <= _NO_SURFACE_VOXELS * config.voxel_size)
 
 
 def lower(field: Field, points_world: jax.Array) -> jax.Array:

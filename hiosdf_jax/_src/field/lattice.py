@@ -1,6 +1,7 @@
 """Answers of a baked field: samples on a regular lattice, interpolated trilinearly.
 
-`blend` has the same functions for a live map: `bounds`, `sdf`, `frontier`, `observed`, `lower`.
+`blend` has the same functions for a live map: `bounds`, `sdf`, `frontier`, `is_certain`,
+`lower`.
 """
 
 from __future__ import annotations
@@ -37,9 +38,10 @@ def frontier(baked: Baked, points_world: jax.Array) -> jax.Array:
     return interpolate(baked, baked.frontier, points_world)
 
 
-def observed(baked: Baked, points_world: jax.Array) -> jax.Array:
-    """Returns a mask of the points, (..., 3) m inside the box, whose frontier is positive."""
-    return frontier(baked, points_world) > 0
+def is_certain(baked: Baked, points_world: jax.Array) -> jax.Array:
+    """Returns true, (...) bool, for points (..., 3) m: the samples do not tell."""
+    del baked
+    return jnp.ones(points_world.shape[:-1], bool)
 
 
 def lower(baked: Baked, points_world: jax.Array) -> jax.Array:

@@ -196,8 +196,8 @@ def _queries(unknown: Unknown) -> Evaluate:
 
 def _all_answers(field: Field | Baked, points: jax.Array, unknown: Unknown) -> Query:
     place = _place(field, points)
-    observed = (place.beyond <= 0) & _answers_of(field).observed(field, place.nearest)
     frontier = _frontier(field, place)
+    observed = (frontier > 0) & _answers_of(field).is_certain(field, place.nearest)
     sdf, grad = _with_gradient(field, points, unknown, "sdf")
     lower, lower_grad = _with_gradient(field, points, "network", "lower")
     return Query(sdf, grad, observed, frontier, lower, lower_grad)
