@@ -1,17 +1,13 @@
-"""Meshes against planes, spheres and creases known in closed form, and by a slow construction."""
-
-import itertools
+"""Meshes of planes, spheres and creases known in closed form, and the level by slow numpy."""
 
 import jax
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from room import HALF
 
 import hiosdf_jax as hio
-from hiosdf_jax._src.field import polygons
+from hiosdf_jax._src.field import contouring, implicit_surface
 from hiosdf_jax._src.field.mesh import extract_mesh
 from hiosdf_jax._src.state.pytrees import NO_FEATURE
 
@@ -97,7 +93,8 @@ def test_a_square_is_one_flat_piece_without_holes(seed):
     assert np.abs(local[:, :2]).max() < 0.6 + 0.08
     beyond = np.abs(((found.triangles_center - center) @ turn)[:, :2]).max(axis=1) > 0.61
     assert found.area_faces[beyond].sum() < 0.02 * found.area
-    assert found.area == pytest.approx(1.2**2, rel=0.03)
+    # Narrow patches along the border are drawn once more.
+    assert found.area == pytest.approx(1.2**2, rel=0.04)
     # Away from the border: covered everywhere, and once.
     inner = center + square(seed + 100, turn, 0.0, half=0.5, count=5_000)
     distance = distance_to(found, inner)
@@ -166,62 +163,188 @@ def test_a_crease_stays_sharp():
 
 def test_the_triangles_of_a_plane_have_common_vertices():
     turn = rotation(3)
-    field = field_of(square(3, turn, 0.0), turn[:, 2])
-    vertex, normal, face, _ = polygons.triangulate(field.surface)
-    found = trimesh.Trimesh(vertex, face, process=False)
-    pieces = trimesh.graph.connected_components(
-        found.face_adjacency, min_len=1, nodes=np.arange(len(found.faces))
-    )
-    # Without the strips of two hits.
-    pieces = [piece for piece in pieces if found.area_faces[piece].sum() > 0.01]
-    found.update_faces(np.concatenate(pieces))
-    local = (found.vertices * VOXEL + np.array(field.config.corner_index) * VOXEL) @ turn
+    found = extract_mesh(field_of(square(3, turn, 0.0), turn[:, 2]))
+    np.testing.assert_allclose(np.linalg.norm(found.vertex_normals, axis=1), 1, atol=1e-6)
+    pieces = trimesh.graph.connected_components(found.face_adjacency)
+    largest = max(pieces, key=len)
+    # The others are hits on lines.
+    assert found.area_faces[largest].sum() > 0.99 * found.area
+    found.update_faces(largest)
     border = found.edges[trimesh.grouping.group_rows(found.edges_sorted, require_count=1)]
-    inner = np.abs(local[border].mean(axis=1)[:, :2]).max(axis=1) < 0.45
-    assert inner.sum() < 0.03 * len(found.edges_unique)
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-9)
+    local = found.vertices[border].mean(axis=1) @ turn
+    inner = np.abs(local[:, :2]).max(axis=1) < 0.55
+    assert inner.sum() < 0.01 * len(found.edges_unique)
 
 
-def slow_cut(center, normal, low, high):
-    """The corners of a plane's part in a box: where the plane meets the box's twelve edges."""
-    found = []
-    for axis in range(3):
-        others = [k for k in range(3) if k != axis]
-        for ends in itertools.product((0, 1), repeat=2):
-            point = center.copy()
-            for k, end in zip(others, ends, strict=True):
-                point[k] = (low, high)[end][k]
-            if abs(normal[axis]) < 1e-9:
+def slow_level(surface, points):
+    """The surface's function in float64, one point and patch at a time; points in voxels."""
+    nearest = np.asarray(surface.derived.nearest)
+    mean, axes = (np.asarray(a).astype(float) for a in (surface.mean, surface.axes))
+    rows = []
+    for point in points:
+        known = []
+        low = np.floor(point - 0.5).astype(int)
+        for step in np.ndindex(2, 2, 2):
+            voxel = low + step
+            inside = (voxel >= 0).all() and (voxel < nearest.shape[:3]).all()
+            if not inside or nearest[tuple(voxel)][0] == NO_FEATURE:
                 continue
-            point[axis] = 0.0
-            point[axis] = (normal @ center - normal @ point) / normal[axis]
-            if low[axis] <= point[axis] <= high[axis]:
-                found.append(point)
-    return np.array(found).reshape(-1, 3)
+            site = voxel + nearest[tuple(voxel)]
+            u, v, w = axes[tuple(site)]
+            offset = point - (site + 0.5 + mean[tuple(site)])
+            normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+            reach = offset.copy()
+            for axis in (u, v):
+                half = 0.9 * 3**0.5 * axis
+                reach -= np.clip(reach @ half / max(half @ half, 1e-12), -1, 1) * half
+            share = np.prod(np.where(step, point - 0.5 - low, low + 1.5 - point))
+            area = np.linalg.norm(u) * np.linalg.norm(v)
+            thickness = np.linalg.norm(w)
+            rank = np.linalg.norm(reach) + 3 * thickness
+            known.append((rank, share * area, offset, normal, reach, thickness))
+        if not known:
+            rows.append((1.0, 9.0))
+            continue
+        rank, _, own_offset, own, own_reach, _ = min(known, key=lambda patch: patch[0])
+        total = height = 0.0
+        blended = np.zeros(3)
+        for other_rank, weight, offset, normal, _, _ in known:
+            sign = 1
+            if normal @ own < -0.7:
+                sign = -1
+                if abs(own_offset @ own - offset @ own) >= 0.2:
+                    continue
+            weight = max(weight * np.exp((rank - other_rank) / 0.3), 1e-6)
+            total += weight
+            height += weight * sign * (offset @ normal)
+            blended += weight * sign * normal
+        blended /= np.linalg.norm(blended)
+        flat = [patch[4] - (patch[4] @ blended) * blended for patch in known]
+        side = own_reach - (own_reach @ blended) * blended
+        beyond = np.linalg.norm(side) - 0.05
+        for reach in flat:
+            lengths = np.linalg.norm(side), np.linalg.norm(reach)
+            if reach @ side <= -0.7 * np.prod(lengths):
+                beyond = min(beyond, sum(lengths) - 0.6)
+        nearest_patch = min(np.linalg.norm(patch[4]) for patch in known)
+        rows.append((height / total, max(beyond, nearest_patch - 0.45)))
+    return np.array(rows).T
 
 
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10**6))
-def test_polygons_are_the_cuts_of_planes_with_boxes(seed):
+def test_the_level_is_that_of_a_slow_reference():
+    """Random patches, of which some face away from each other, and some are thick or narrow."""
+    rng = np.random.default_rng(0)
+    clouds = []
+    for _ in range(60):
+        low = rng.integers(-4, 4, 3)
+        axes = rng.normal(size=(3, 3)) * [[0.25], [0.15], [0.04]] * rng.uniform(0.3, 1, (3, 1))
+        spread = (
+            0.5 + rng.uniform(-0.2, 0.2, 3) + np.clip(rng.normal(size=(30, 3)) @ axes, -0.2, 0.2)
+        )
+        clouds.append((low + spread) * VOXEL)
+    field = field_of(np.concatenate(clouds), rng.normal(size=3))
+    config = field.config
+    points = rng.uniform(5, 15, (3_000, 3))
+    world = (points + config.corner_index) * VOXEL
+    found = implicit_surface.evaluate(config, field.surface, world.astype(np.float32))
+    height, beyond = slow_level(field.surface, points)
+    assert np.mean(height != 1) > 0.3
+    # Where two patches are equally near, rounding chooses.
+    np.testing.assert_allclose(np.sort(np.abs(found.height - height))[:-15], 0, atol=2e-3)
+    np.testing.assert_allclose(np.sort(np.abs(found.beyond - beyond))[:-60], 0, atol=5e-3)
+
+
+def lattice(cells=20):
+    near = np.zeros((cells + 1 + 2 * contouring.PADDING,) * 3, bool)
+    near[2:-2, 2:-2, 2:-2] = True
+    # Off the lattice.
+    return near, cells / contouring.CELLS_PER_VOXEL / 2 + np.array([0.03, 0.11, 0.07])
+
+
+def level_of(height, beyond, normal):
+    return implicit_surface.Level(height, beyond, normal, normal, height, height, height)
+
+
+@pytest.mark.parametrize("outward", [True, False])
+def test_the_contour_of_a_sphere_is_closed(outward):
+    near, middle = lattice()
+    sign = 1 if outward else -1
+
+    def function(position):
+        offset = position - middle
+        depth = np.linalg.norm(offset, axis=1)
+        return level_of(
+            sign * (depth - 3.3), np.full(len(depth), -1.0), sign * offset / depth[:, None]
+        )
+
+    found = trimesh.Trimesh(*contouring.contour(near, function), process=False)
+    assert found.is_watertight and found.is_winding_consistent
+    assert found.euler_number == 2
+    assert found.volume == pytest.approx(sign * 4 / 3 * np.pi * 3.3**3, rel=0.03)
+    assert np.abs(np.linalg.norm(found.vertices - middle, axis=1) - 3.3).max() < 0.03
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_contour_of_a_disc_ends_at_its_edge(seed):
+    """Also if the sensor's side changes at random: a sheet that was seen from both sides."""
+    near, middle = lattice()
+    turn = rotation(seed)
     rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(5, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    low, high = rng.uniform(-0.5, -0.01, (5, 3)), rng.uniform(0.01, 0.5, (5, 3))
-    center = rng.uniform(low, high)
-    sides = np.concatenate([np.eye(3), -np.eye(3)])
-    direction = np.broadcast_to(sides[:, None], (6, 5, 3))
-    limit = np.concatenate([(high - center).T, (center - low).T])
-    cut = polygons.cut_polygons(
-        polygons.Patches(center, normal, direction, limit, np.zeros(5, bool))
+
+    def function(position):
+        local = (position - middle) @ turn
+        sign = rng.choice([-1.0, 1.0], len(local)) if seed else np.ones(len(local))
+        beyond = np.linalg.norm(local[:, :2], axis=1) - 3.2
+        return level_of(sign * local[:, 2], beyond, sign[:, None] * turn[:, 2])
+
+    vertex, face = contouring.contour(near, function)
+    local = (vertex - middle) @ turn
+    assert np.abs(local[:, 2]).max() < 1e-9
+    radius = np.linalg.norm(local[:, :2], axis=1)
+    assert radius.max() == pytest.approx(3.2, abs=0.03)
+    found = trimesh.Trimesh(vertex, face, process=False)
+    assert found.area == pytest.approx(np.pi * 3.2**2, rel=0.02)
+    border = found.edges[trimesh.grouping.group_rows(found.edges_sorted, require_count=1)]
+    assert radius[border].min() > 3.1
+    assert found.euler_number == 1
+    if not seed:
+        assert (found.face_normals @ turn[:, 2] > 0.99).all()
+
+
+def test_a_gap_is_closed_if_it_is_narrow():
+    """Two coplanar squares, 4 cm and 16 cm apart."""
+    for gap, closed in ((0.04, True), (0.16, False)):
+        points = square(0, np.eye(3), np.array([0.0, 0.0, 0.04]))
+        points = points[np.abs(points[:, 0] - 0.05) > gap / 2]
+        found = extract_mesh(field_of(points, (0, 0, 1)))
+        middle = np.stack([np.full(50, 0.05), np.linspace(-0.5, 0.5, 50), np.full(50, 0.04)], 1)
+        distance = distance_to(found, middle)
+        assert (distance.max() < 1e-3) if closed else (distance.min() > 0.05)
+
+
+def test_stray_hits_inside_a_wall_leave_its_sides_whole():
+    """A wall of one voxel, seen from both sides, with stray hits of both in its middle."""
+    rng = np.random.default_rng(0)
+    sides = [square(k, np.eye(3), np.array([0.0, 0.0, z])) for k, z in enumerate((-0.005, 0.105))]
+    stray = rng.uniform([-0.6, -0.6, 0.001], [0.6, 0.6, 0.099], (4_000, 3))
+    low, high = field_of(sides[0], (0, 0, -1)), field_of(sides[1], (0, 0, 1))
+    inside = field_of(stray, (1.0, 0.3, 0.05))
+    surfaces = [field.surface for field in (low, high, inside)]
+    whole = low.replace(
+        surface=surfaces[0].replace(
+            mean=sum(s.mean for s in surfaces),
+            axes=sum(s.axes for s in surfaces),
+            derived=surfaces[0].derived.replace(
+                nearest=np.max([s.derived.nearest for s in surfaces], axis=0)
+            ),
+        )
     )
-    for k in range(5):
-        corners = cut.corner[k, : cut.count[k]]
-        expected = slow_cut(center[k], normal[k], low[k], high[k])
-        assert len(corners) >= len(expected) >= 3
-        apart = np.linalg.norm(corners[:, None] - expected[None], axis=-1)
-        assert apart.min(axis=0).max() < 1e-9 and apart.min(axis=1).max() < 1e-9
-        around = np.cross(corners - center[k], np.roll(corners, -1, axis=0) - center[k])
-        assert (around @ normal[k] > -1e-12).all()
+    found = extract_mesh(whole)
+    for z in (-0.005, 0.105):
+        inner = square(7, np.eye(3), np.array([0.0, 0.0, z]), half=0.5, count=2_000)
+        distance = distance_to(found, inner)
+        assert np.mean(distance < 0.005) > 0.95
+        assert distance.max() < 0.03
 
 
 def test_hits_on_a_line_are_a_narrow_strip_that_faces_the_sensor():
@@ -232,8 +355,8 @@ def test_hits_on_a_line_are_a_narrow_strip_that_faces_the_sensor():
         ahead = (toward - points.mean(axis=0)) * (0, 1, 1)
         np.testing.assert_allclose(found.vertex_normals @ ahead, np.linalg.norm(ahead), rtol=1e-3)
         low, high = found.bounds
-        assert (high - low)[0] == pytest.approx(min(3 * points[:, 0].std(), VOXEL), abs=2e-3)
-        assert np.linalg.norm((high - low)[1:]) == pytest.approx(3 * 3e-3 * VOXEL, rel=0.1)
+        assert (high - low)[0] == pytest.approx(2 * 0.9 * 3**0.5 * points[:, 0].std(), abs=1e-3)
+        assert np.linalg.norm((high - low)[1:]) == pytest.approx(2 * 5e-3 * VOXEL, rel=0.1)
         np.testing.assert_allclose((low + high) / 2, points.mean(axis=0), atol=1e-3)
 
 
@@ -242,7 +365,7 @@ def test_a_hit_alone_has_no_surface():
 
 
 def test_a_strip_beside_a_plane_leaves_it_as_it_is():
-    """Its own plane is not known, so neither continues the other."""
+    """Its own plane is not known; it closes no more than the gap to the plane."""
     plane = square(0, np.eye(3), np.array([0.0, 0.0, 0.05]), half=0.3)
     line = np.array([[0.31, 0.05, 0.05], [0.39, 0.05, 0.06]])
     alone, both = (
@@ -250,10 +373,8 @@ def test_a_strip_beside_a_plane_leaves_it_as_it_is():
         for points in (plane, np.concatenate([plane, line]))
     )
     assert len(both.faces) > len(alone.faces)
-    assert both.area == pytest.approx(alone.area, rel=1e-3)
-    strip = both.vertices[both.vertices[:, 0] > 0.302]
-    assert len(strip) >= 4
-    assert distance_to_line(strip, *line).max() < 1e-3
+    assert both.area == pytest.approx(alone.area, rel=1e-2)
+    assert distance_to_line(both.vertices[-4:], *line).max() < 1e-3  # the rectangle of the strip
 
 
 @pytest.mark.parametrize("resolution", [1.0, 0.1, 0.05, 0.025])

@@ -3,41 +3,63 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
+from scipy import ndimage
 
-from hiosdf_jax._src.field import mean_surface, polygons
+from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.field import contouring, implicit_surface
+from hiosdf_jax._src.field.contouring import CELLS_PER_VOXEL, PADDING
+from hiosdf_jax._src.field.implicit_surface import NARROW_VOXELS, Level
 from hiosdf_jax._src.field.lattice import check_resolution
+from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.state.checks import as_live_field
-from hiosdf_jax._src.state.pytrees import Field, MapState
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Field, MapState, Surface
 
 if TYPE_CHECKING:
     import trimesh
 
-# One batch shape for all vertices: one compilation, and memory does not grow with the map.
+# One batch shape for all points: one compilation, and memory does not grow with the map.
 _CHUNK = 65536
 
 # About 10 GB while they are made.
 _MOST_TRIANGLES = 50_000_000
 
+# A narrow patch this far from broader ones that continue its plane, voxels, is drawn as it is: a
+# lattice would miss it.
+_ALONE_VOXELS = 0.5
+
+# A patch is drawn at least this wide to each side, voxels. One whose first axis is shorter is a
+# single hit and is not drawn.
+_LEAST_HALF_WIDTH = 5e-3
+_LEAST_LENGTH = 3e-3
+
+# The corners of triangles lie between the points where the surface crosses the lattice. They move
+# onto the surface if it is at most this far, voxels.
+_MOVED_VOXELS = 0.3
+
+# Points along each side of a patch that mark the cells of the lattice near it.
+_MARKS = 5
+
 
 def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.Trimesh:
     """Extracts the observed surfaces of a map.
 
-    The mesh consists of the surface patches of the grid, joined along the edges of the voxels. It
-    has surfaces where rays ended, and nowhere else. A sheet that was seen from both sides, such as
-    a door, is a single surface. Returns on a line in a voxel, such as two alone, are a strip 1 % of
-    a voxel wide. Time and memory follow the surface, not the bounds.
+    The mesh is the zero level of a blend of the grid's surface patches. It has surfaces where rays
+    ended, and closes gaps between them that are narrower than 0.6 voxels. A sheet that was seen
+    from both sides, such as a door, is a single surface, or two if it is thicker than 0.2 voxels.
+    A part thinner than half a voxel that stands alone, such as a table's leg, is a row of
+    rectangles. Time and memory follow the surface, not the bounds.
 
     Args:
         field: A map or a snapshot of one. The network has no part in the mesh.
-        resolution: The edges of the triangles are about as long, m, and at most as long as those
-            of the voxels.
+        resolution: The edges of the triangles are about as long, m, and at most about as long as
+            half a voxel.
 
     Returns:
         The mesh, m, world frame, with vertex normals on the side that the sensor was on; without
@@ -58,38 +80,147 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     if is_traced(*jax.tree.leaves(field)):
         raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
     config, surface = field.config, field.surface
-    vertices, normals, faces, is_strip = polygons.triangulate(surface)
-    if not len(faces):
+    patches = _find_patches(surface)
+    if not len(patches.center):
         return trimesh.Trimesh()
-    halvings = max(0, math.ceil(math.log2(config.voxel_size) - math.log2(spacing) - 1e-6))
-    triangles = len(faces) * 4.0 ** min(halvings, 100)
+
+    def function(position: np.ndarray) -> Level:
+        return _evaluate_in_chunks(config, surface, position)
+
+    near = _points_near(patches, config.grid_shape)
+    vertex, face = contouring.contour(near, function)
+    coarsest = config.voxel_size / CELLS_PER_VOXEL
+    halvings = max(0, math.ceil(math.log2(coarsest) - math.log2(spacing) - 1e-6))
+    triangles = len(face) * 4.0 ** min(halvings, 100)
     if triangles > _MOST_TRIANGLES:
         raise ValueError(
             f"resolution is {resolution} m, which needs {triangles:.3g} triangles, expected at "
             f"most {_MOST_TRIANGLES}"
         )
-    for _ in range(halvings):
-        rows = np.concatenate([vertices, normals, is_strip[:, None]], axis=-1)
-        rows, faces = trimesh.remesh.subdivide(rows, faces)[:2]
-        vertices, normals, is_strip = rows[:, :3], rows[:, 3:6], rows[:, 6] > 0
-    points = ((vertices + config.corner_index) * config.voxel_size).astype(np.float32)
-    normals = polygons.unit(normals).astype(np.float32)
-    moved, turned = np.empty_like(points), np.empty_like(normals)
-    spread = np.empty(len(points), np.float32)
-
-    def move(row: np.ndarray) -> tuple[jax.Array, ...]:
-        return _move(config, surface, points[row], normals[row])
-
-    fill_in_chunks(move, {"points": moved, "normals": turned, "spread": spread}, _CHUNK)
-    # A strip has no plane to be averaged with others: it lies where its hits are.
-    moved[is_strip], turned[is_strip] = points[is_strip], normals[is_strip]
+    whole = _refine(vertex, face, halvings, function)
+    alone = _rectangles(patches, function)
     return trimesh.Trimesh(
-        moved,
-        faces,
-        vertex_normals=turned,
-        vertex_attributes={"spread": spread},
+        (np.concatenate([whole.vertex, alone.vertex]) + config.corner_index) * config.voxel_size,
+        np.concatenate([whole.face, alone.face + len(whole.vertex)]),
+        vertex_normals=np.concatenate([whole.normal, alone.normal]),
+        vertex_attributes={
+            "spread": np.concatenate([whole.spread, alone.spread]) * config.voxel_size
+        },
         process=False,
     )
 
 
-_move = jax.jit(plain(mean_surface.move_to_surface), static_argnums=0)
+class _Triangles(NamedTuple):
+    """Triangles with common vertices, in voxels from the corner of the grid.
+
+    Attributes:
+        vertex: (V, 3).
+        normal: Unit vectors toward the sensor's side, (V, 3).
+        spread: Of the hits along the normal, (V,) voxels.
+        face: Rows of vertices, counterclockwise around the normal, (F, 3).
+    """
+
+    vertex: np.ndarray
+    normal: np.ndarray
+    spread: np.ndarray
+    face: np.ndarray
+
+
+class _Patches(NamedTuple):
+    """The patches that queries use, in voxels from the corner of the grid.
+
+    Attributes:
+        center: Mean of the hits, (M, 3).
+        axes: Half edges of the rectangle and half thickness, descending, (M, 3, 3).
+    """
+
+    center: np.ndarray
+    axes: np.ndarray
+
+
+def _find_patches(surface: Surface) -> _Patches:
+    """Finds the patches that queries use, without single hits."""
+    nearest, mean, axes = (
+        np.asarray(array) for array in (surface.derived.nearest, surface.mean, surface.axes)
+    )
+    known = np.argwhere(nearest[..., 0] != NO_FEATURE)
+    used = np.zeros(nearest.shape[:3], bool)
+    used[tuple((known + nearest[tuple(known.T)]).T)] = True
+    index = np.argwhere(used)
+    axes = axes[used].astype(float)
+    drawn = np.linalg.norm(axes[:, 0], axis=-1) > _LEAST_LENGTH
+    center = index + 0.5 + mean[used].astype(float)
+    return _Patches(center[drawn], EXTENT_DEVIATIONS * axes[drawn])
+
+
+def _points_near(patches: _Patches, shape: tuple[int, ...]) -> np.ndarray:
+    """Marks the points of the lattice nearest to patches, and those beside them, bool."""
+    most = np.multiply(shape, CELLS_PER_VOXEL)
+    near = np.zeros(most + 1 + 2 * PADDING, bool)
+    along = np.linspace(-1, 1, _MARKS)
+    for a in along:
+        for b in along:
+            mark = patches.center + a * patches.axes[:, 0] + b * patches.axes[:, 1]
+            point = np.clip(np.rint(CELLS_PER_VOXEL * mark).astype(int), 0, most)
+            near[tuple((point + PADDING).T)] = True
+    return ndimage.binary_dilation(near, np.ones((3, 3, 3)))
+
+
+def _refine(
+    vertex: np.ndarray, face: np.ndarray, halvings: int, function: contouring.Function
+) -> _Triangles:
+    """Splits triangles into four, and moves their corners onto the surface.
+
+    Args:
+        vertex: (V, 3) voxels.
+        face: Rows of vertices, (F, 3).
+        halvings: How often they are split.
+        function: Has the surface as its zero level.
+
+    Returns:
+        The triangles.
+    """
+    import trimesh
+
+    for _ in range(halvings):
+        vertex, face = trimesh.remesh.subdivide(vertex, face)[:2]
+    level = function(vertex)
+    near = np.abs(level.height) < _MOVED_VOXELS
+    height = np.where(near, level.height, 0)
+    return _Triangles(vertex - height[:, None] * level.normal, level.normal, level.spread, face)
+
+
+def _rectangles(patches: _Patches, function: contouring.Function) -> _Triangles:
+    """Draws the narrow patches that stand alone as rectangles, two triangles each."""
+    width = np.linalg.norm(patches.axes[:, 1], axis=-1)
+    narrow = np.flatnonzero(width < NARROW_VOXELS)
+    level = function(patches.center[narrow])
+    row = narrow[level.continued > _ALONE_VOXELS]
+    first, second, third = np.swapaxes(patches.axes[row], 0, 1)
+    normal = np.cross(first, second)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    second = second * np.maximum(1, _LEAST_HALF_WIDTH / width[row])[:, None]
+    corner = [a * first + b * second for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    vertex = (patches.center[row] + np.stack(corner)).swapaxes(0, 1).reshape(-1, 3)
+    start = 4 * np.arange(len(row))[:, None]
+    face = np.concatenate([start + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])
+    spread = np.linalg.norm(third, axis=-1) / EXTENT_DEVIATIONS
+    return _Triangles(vertex, np.repeat(normal, 4, axis=0), np.repeat(spread, 4), face)
+
+
+def _evaluate_in_chunks(config: Config, surface: Surface, positions: np.ndarray) -> Level:
+    """Evaluates the surface's function at positions (N, 3), voxels from the grid's corner."""
+    points_world = (positions + config.corner_index) * config.voxel_size
+    points_world = points_world.astype(np.float32)
+    count = len(points_world)
+    shapes = {"normal": (count, 3), "plane_normal": (count, 3)}
+    level = {name: np.empty(shapes.get(name, count), np.float32) for name in Level._fields}
+
+    def evaluate(row: np.ndarray) -> Level:
+        return _evaluate(config, surface, points_world[row])
+
+    fill_in_chunks(evaluate, level, _CHUNK)
+    return Level(**level)
+
+
+_evaluate = jax.jit(plain(implicit_surface.evaluate), static_argnums=0)

@@ -146,6 +146,7 @@ class Patches(NamedTuple):
     Attributes:
         found: The voxel knows a patch, (8, ...) bool.
         distance: From the patch, (8, ...) voxels; 0 where none was found.
+        slope: Of the distance by the point, (8, ...) each.
         height: Above its plane, (8, ...) voxels, positive on the sensor's side.
         offset: Of the point from the patch's mean, (8, ...) voxels each.
         normal: Unit vectors, (8, ...) each.
@@ -156,6 +157,7 @@ class Patches(NamedTuple):
 
     found: jax.Array
     distance: jax.Array
+    slope: Vector
     height: jax.Array
     offset: Vector
     normal: Vector
@@ -210,7 +212,7 @@ def patches_at(
     height = dot(above, normal)
     distance = jnp.where(found, distance, 0)
     width = length(take(axes, row, 3))
-    return Patches(found, distance, height, above, normal, width, length(across), spread)
+    return Patches(found, distance, slope, height, above, normal, width, length(across), spread)
 
 
 class _Space(NamedTuple):
