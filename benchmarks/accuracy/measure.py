@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -20,7 +20,11 @@ from benchmarks.accuracy.sources import Source
 from benchmarks.variants import VARIANTS
 from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field.compiled import CompiledQueries
+from hiosdf_jax._src.field.patch_rectangles import as_rectangles, find_patches
 from hiosdf_jax._src.state.pytrees import Field, field_of
+
+if TYPE_CHECKING:
+    import trimesh
 
 # Forgetting compares the error in the region of the first frames, right after them and at the end.
 EARLY_FRAMES = 20
@@ -124,11 +128,21 @@ def _score_surface(field: Field, source: Source, held_out_world: np.ndarray) -> 
         scores = scoring.evaluate_mesh(mesh, source.truth, source.distance)
         queries, config = CompiledQueries(field), field.config
         return scores | scoring.evaluate_steps(
-            queries.sdf, queries.observed, config.bounds, mesh, config.voxel_size
+            queries.sdf, queries.observed, config.bounds, _patches_of(field), config.voxel_size
         )
     except ModuleNotFoundError as error:
         print(f"the mesh is not scored: {error}")
         return {}
+
+
+def _patches_of(field: Field) -> trimesh.Trimesh:
+    """Returns all surface patches as a mesh; `extract_mesh` leaves out those inside walls."""
+    import trimesh
+
+    config = field.config
+    found = as_rectangles(find_patches(field.surface))
+    vertices_world = (found.vertex + config.corner_index) * config.voxel_size
+    return trimesh.Trimesh(vertices_world, found.face, process=False)
 
 
 def _score_held_out(name: str, field: Field, points_world: np.ndarray) -> dict[str, float]:

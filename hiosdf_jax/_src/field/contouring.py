@@ -33,8 +33,8 @@ class _Crossings(NamedTuple):
     """Edges of the lattice that the level crosses.
 
     Attributes:
-        cell: Numbers of the four cells around the edge, counterclockwise around the side that is
-            positive at its first end, (E, 4).
+        cell: Flat indices of the four cells around the edge, counterclockwise seen from the
+            positive side, (E, 4).
         position: Where the level crosses, (E, 3) voxels.
         beyond: As in `Level`, (E,).
     """
@@ -56,31 +56,35 @@ def contour(near: np.ndarray, function: Function) -> tuple[np.ndarray, np.ndarra
         Vertices (V, 3), voxels from the grid's corner, and triangles: rows of vertices,
         counterclockwise seen from the positive side, (F, 3).
     """
-    index = np.argwhere(near)
-    position = (index - PADDING) / CELLS_PER_VOXEL
+    number = np.flatnonzero(near)
+    position = (np.stack(np.unravel_index(number, near.shape), axis=-1) - PADDING) / CELLS_PER_VOXEL
     level = function(position)
-    row = np.full(near.shape, -1, np.int32)
-    row[near] = np.arange(len(index), dtype=np.int32)
-    edges = [_find_crossings(row, index, position, level, axis) for axis in range(3)]
+    strides = near.shape[1] * near.shape[2], near.shape[2], 1
+    edges = [_find_crossings(number, strides, position, level, axis) for axis in range(3)]
     vertex, face, beyond = _triangulate(_Crossings(*map(np.concatenate, zip(*edges, strict=True))))
     return _cut(vertex, face, beyond, function)
 
 
 def _find_crossings(
-    row: np.ndarray, index: np.ndarray, position: np.ndarray, level: Level, axis: int
+    number: np.ndarray,
+    strides: tuple[int, int, int],
+    position: np.ndarray,
+    level: Level,
+    axis: int,
 ) -> _Crossings:
     """Finds where the level crosses the edges along an axis.
 
     Args:
-        row: The row of each lattice point that is known, -1 for the others, (X, Y, Z).
-        index: Lattice points, (N, 3).
+        number: Flat indices of lattice points, ascending, (N,).
+        strides: What a step along each axis adds to them.
         position: Their positions, (N, 3) voxels.
         level: The level there.
         axis: 0, 1 or 2.
     """
-    # No lattice point at the end of an axis is known.
-    second = row[tuple((index + np.eye(3, dtype=int)[axis]).T)]
-    first = np.flatnonzero(second >= 0)
+    # No point lies at the end of an axis, where a step would lead to its beginning.
+    after = number + strides[axis]
+    second = np.searchsorted(number[:-1], after)
+    first = np.flatnonzero(number[second] == after)
     second = second[first]
     normal = level.plane_normal
     opposite = np.einsum("ij,ij->i", normal[first], normal[second]) < OPPOSITE_COSINE
@@ -92,11 +96,8 @@ def _find_crossings(
     first, second, low, high = (values[crossed] for values in (first, second, low, high))
     share = low / (low - high)
     beyond = level.beyond[first] + share * (level.beyond[second] - level.beyond[first])
-    steps = np.eye(3, dtype=int)
-    one, other = steps[(axis + 1) % 3], steps[(axis + 2) % 3]
-    around = np.stack([-one - other, -other, 0 * one, -one])
-    x, y, z = np.moveaxis(index[first][:, None] + around, -1, 0)
-    cell = (x * row.shape[1] + y) * row.shape[2] + z
+    one, other = strides[(axis + 1) % 3], strides[(axis + 2) % 3]
+    cell = number[first][:, None] - [one + other, other, 0, one]
     cell = np.where((low > 0)[:, None], cell[:, ::-1], cell)
     crossing = position[first]
     crossing[:, axis] += share / CELLS_PER_VOXEL

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -14,12 +14,17 @@ from hiosdf_jax._src.field import contouring, implicit_surface
 from hiosdf_jax._src.field.contouring import CELLS_PER_VOXEL, PADDING
 from hiosdf_jax._src.field.implicit_surface import NARROW_VOXELS, Level
 from hiosdf_jax._src.field.lattice import check_resolution
-from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
+from hiosdf_jax._src.field.patch_rectangles import (
+    Patches,
+    Triangles,
+    as_rectangles,
+    find_patches,
+)
 from hiosdf_jax._src.numerics.chunks import fill_in_chunks
 from hiosdf_jax._src.numerics.intake import is_traced
 from hiosdf_jax._src.numerics.modes import plain
 from hiosdf_jax._src.state.checks import as_live_field
-from hiosdf_jax._src.state.pytrees import NO_FEATURE, Field, MapState, Surface
+from hiosdf_jax._src.state.pytrees import Field, MapState, Surface
 
 if TYPE_CHECKING:
     import trimesh
@@ -34,10 +39,8 @@ _MOST_TRIANGLES = 50_000_000
 # lattice would miss it.
 _ALONE_VOXELS = 0.5
 
-# A patch is drawn at least this wide to each side, voxels. One whose first axis is shorter is a
-# single hit and is not drawn.
-_LEAST_HALF_WIDTH = 5e-3
-_LEAST_LENGTH = 3e-3
+# A shorter patch, voxels to each side, is a single hit and is not drawn.
+_LEAST_LENGTH = 5e-3
 
 # The corners of triangles lie between the points where the surface crosses the lattice. They move
 # onto the surface if it is at most this far, voxels.
@@ -80,7 +83,8 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     if is_traced(*jax.tree.leaves(field)):
         raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
     config, surface = field.config, field.surface
-    patches = _find_patches(surface)
+    patches = find_patches(surface)
+    patches = patches.part(np.linalg.norm(patches.axes[:, 0], axis=-1) > _LEAST_LENGTH)
     if not len(patches.center):
         return trimesh.Trimesh()
 
@@ -98,7 +102,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
             f"most {_MOST_TRIANGLES}"
         )
     whole = _refine(vertex, face, halvings, function)
-    alone = _rectangles(patches, function)
+    alone = as_rectangles(_find_rods(patches, function))
     return trimesh.Trimesh(
         (np.concatenate([whole.vertex, alone.vertex]) + config.corner_index) * config.voxel_size,
         np.concatenate([whole.face, alone.face + len(whole.vertex)]),
@@ -110,50 +114,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     )
 
 
-class _Triangles(NamedTuple):
-    """Triangles with common vertices, in voxels from the corner of the grid.
-
-    Attributes:
-        vertex: (V, 3).
-        normal: Unit vectors toward the sensor's side, (V, 3).
-        spread: Of the hits along the normal, (V,) voxels.
-        face: Rows of vertices, counterclockwise around the normal, (F, 3).
-    """
-
-    vertex: np.ndarray
-    normal: np.ndarray
-    spread: np.ndarray
-    face: np.ndarray
-
-
-class _Patches(NamedTuple):
-    """The patches that queries use, in voxels from the corner of the grid.
-
-    Attributes:
-        center: Mean of the hits, (M, 3).
-        axes: Half edges of the rectangle and half thickness, descending, (M, 3, 3).
-    """
-
-    center: np.ndarray
-    axes: np.ndarray
-
-
-def _find_patches(surface: Surface) -> _Patches:
-    """Finds the patches that queries use, without single hits."""
-    nearest, mean, axes = (
-        np.asarray(array) for array in (surface.derived.nearest, surface.mean, surface.axes)
-    )
-    known = np.argwhere(nearest[..., 0] != NO_FEATURE)
-    used = np.zeros(nearest.shape[:3], bool)
-    used[tuple((known + nearest[tuple(known.T)]).T)] = True
-    index = np.argwhere(used)
-    axes = axes[used].astype(float)
-    drawn = np.linalg.norm(axes[:, 0], axis=-1) > _LEAST_LENGTH
-    center = index + 0.5 + mean[used].astype(float)
-    return _Patches(center[drawn], EXTENT_DEVIATIONS * axes[drawn])
-
-
-def _points_near(patches: _Patches, shape: tuple[int, ...]) -> np.ndarray:
+def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
     """Marks the points of the lattice nearest to patches, and those beside them, bool."""
     most = np.multiply(shape, CELLS_PER_VOXEL)
     near = np.zeros(most + 1 + 2 * PADDING, bool)
@@ -168,7 +129,7 @@ def _points_near(patches: _Patches, shape: tuple[int, ...]) -> np.ndarray:
 
 def _refine(
     vertex: np.ndarray, face: np.ndarray, halvings: int, function: contouring.Function
-) -> _Triangles:
+) -> Triangles:
     """Splits triangles into four, and moves their corners onto the surface.
 
     Args:
@@ -187,25 +148,14 @@ def _refine(
     level = function(vertex)
     near = np.abs(level.height) < _MOVED_VOXELS
     height = np.where(near, level.height, 0)
-    return _Triangles(vertex - height[:, None] * level.normal, level.normal, level.spread, face)
+    return Triangles(vertex - height[:, None] * level.normal, level.normal, level.spread, face)
 
 
-def _rectangles(patches: _Patches, function: contouring.Function) -> _Triangles:
-    """Draws the narrow patches that stand alone as rectangles, two triangles each."""
+def _find_rods(patches: Patches, function: contouring.Function) -> Patches:
+    """Finds the narrow patches that stand alone."""
     width = np.linalg.norm(patches.axes[:, 1], axis=-1)
-    narrow = np.flatnonzero(width < NARROW_VOXELS)
-    level = function(patches.center[narrow])
-    row = narrow[level.continued > _ALONE_VOXELS]
-    first, second, third = np.swapaxes(patches.axes[row], 0, 1)
-    normal = np.cross(first, second)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    second = second * np.maximum(1, _LEAST_HALF_WIDTH / width[row])[:, None]
-    corner = [a * first + b * second for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    vertex = (patches.center[row] + np.stack(corner)).swapaxes(0, 1).reshape(-1, 3)
-    start = 4 * np.arange(len(row))[:, None]
-    face = np.concatenate([start + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])
-    spread = np.linalg.norm(third, axis=-1) / EXTENT_DEVIATIONS
-    return _Triangles(vertex, np.repeat(normal, 4, axis=0), np.repeat(spread, 4), face)
+    narrow = patches.part(width < NARROW_VOXELS)
+    return narrow.part(function(narrow.center).continued > _ALONE_VOXELS)
 
 
 def _evaluate_in_chunks(config: Config, surface: Surface, positions: np.ndarray) -> Level:

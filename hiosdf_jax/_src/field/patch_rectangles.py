@@ -1,0 +1,77 @@
+"""The surface patches of a grid as rectangles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Surface
+
+# A rectangle is at least this wide to each side, voxels, also if its hits lie on a line.
+_LEAST_HALF_EDGE = 5e-3
+
+
+class Patches(NamedTuple):
+    """Surface patches, in voxels from the corner of the grid.
+
+    Attributes:
+        center: Mean of the hits, (M, 3).
+        axes: Half edges of the rectangle and half thickness, descending, (M, 3, 3).
+    """
+
+    center: np.ndarray
+    axes: np.ndarray
+
+    def part(self, kept: np.ndarray) -> Patches:
+        """Returns the patches of a mask, (M,) bool."""
+        return Patches(self.center[kept], self.axes[kept])
+
+
+class Triangles(NamedTuple):
+    """Triangles with common vertices, in voxels from the corner of the grid.
+
+    Attributes:
+        vertex: (V, 3).
+        normal: Unit vectors toward the sensor's side, (V, 3).
+        spread: Standard deviation of the hits along the normal, (V,) voxels.
+        face: Rows of vertices, counterclockwise around the normal, (F, 3).
+    """
+
+    vertex: np.ndarray
+    normal: np.ndarray
+    spread: np.ndarray
+    face: np.ndarray
+
+
+def find_patches(surface: Surface) -> Patches:
+    """Finds the patches that queries use."""
+    nearest, mean, axes = (
+        np.asarray(array) for array in (surface.derived.nearest, surface.mean, surface.axes)
+    )
+    known = np.argwhere(nearest[..., 0] != NO_FEATURE)
+    used = np.zeros(nearest.shape[:3], bool)
+    used[tuple((known + nearest[tuple(known.T)]).T)] = True
+    center = np.argwhere(used) + 0.5 + mean[used].astype(float)
+    return Patches(center, EXTENT_DEVIATIONS * axes[used].astype(float))
+
+
+def as_rectangles(patches: Patches) -> Triangles:
+    """Draws patches as rectangles, two triangles each."""
+    first, second, third = np.swapaxes(patches.axes, 0, 1)
+    normal = np.cross(first, second)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    first, second = _widened(first), _widened(second)
+    corner = [a * first + b * second for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    vertex = (patches.center + np.stack(corner)).swapaxes(0, 1).reshape(-1, 3)
+    start = 4 * np.arange(len(normal))[:, None]
+    face = np.concatenate([start + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])
+    spread = np.linalg.norm(third, axis=-1) / EXTENT_DEVIATIONS
+    return Triangles(vertex, np.repeat(normal, 4, axis=0), np.repeat(spread, 4), face)
+
+
+def _widened(half_edge: np.ndarray) -> np.ndarray:
+    """Scales vectors (M, 3) to at least the least half edge."""
+    size = np.linalg.norm(half_edge, axis=-1, keepdims=True)
+    return half_edge * np.maximum(1, _LEAST_HALF_EDGE / np.maximum(size, 1e-12))
