@@ -355,8 +355,10 @@ def test_hits_on_a_line_are_a_narrow_strip_that_faces_the_sensor():
         ahead = (toward - points.mean(axis=0)) * (0, 1, 1)
         np.testing.assert_allclose(found.vertex_normals @ ahead, np.linalg.norm(ahead), rtol=1e-3)
         low, high = found.bounds
-        assert (high - low)[0] == pytest.approx(2 * 0.9 * 3**0.5 * points[:, 0].std(), abs=1e-3)
-        assert np.linalg.norm((high - low)[1:]) == pytest.approx(2 * 5e-3 * VOXEL, rel=0.1)
+        assert (high - low)[0] == pytest.approx(
+            min(2 * 0.9 * 3**0.5 * points[:, 0].std(), VOXEL), abs=1e-3
+        )
+        assert np.linalg.norm((high - low)[1:]) == pytest.approx(2 * 5e-3 * VOXEL, rel=0.25)
         np.testing.assert_allclose((low + high) / 2, points.mean(axis=0), atol=1e-3)
 
 

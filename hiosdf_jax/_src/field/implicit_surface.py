@@ -45,8 +45,8 @@ _ACROSS = 0.7
 # Farther from every patch, voxels, there is no surface.
 _FARTHEST_VOXELS = 0.45
 
-NARROW_VOXELS = 0.25
-"""A patch whose half extent along its shorter side is less, voxels, is narrow."""
+# A patch whose half extent along its shorter side is less, voxels, continues no other.
+_NARROW_VOXELS = 0.25
 
 _NONE = 9.0  # voxels; farther than anything
 
@@ -60,8 +60,8 @@ class Level(NamedTuple):
         normal: Of the blended planes, unit vectors, (..., 3).
         plane_normal: Of the nearest patch, unit vectors, (..., 3).
         plane_height: Above the plane of the nearest patch, (...) voxels.
-        continued: Distance from the nearest patch that is not narrow and continues the plane of the
-            nearest patch, (...) voxels.
+        continued: Distance from a patch, not a narrow one, that continues the plane of the nearest
+            patch, (...) voxels.
         spread: Standard deviation of the patches' hits along their normals, (...) voxels.
     """
 
@@ -124,7 +124,7 @@ def evaluate(config: Config, surface: Surface, points_world: jax.Array) -> Level
     least = jnp.min(away, axis=0)
     beyond = jnp.maximum(beyond, least - _FARTHEST_VOXELS)
 
-    continues = (EXTENT_DEVIATIONS * patch.width >= NARROW_VOXELS) & same_sheet
+    continues = (EXTENT_DEVIATIONS * patch.width >= _NARROW_VOXELS) & same_sheet
     continues &= jnp.abs(cosine) > -OPPOSITE_COSINE
     some = least < _NONE
     return Level(
