@@ -401,10 +401,11 @@ def test_misuse_is_named():
             extract_mesh(None, resolution)
     with pytest.raises(ValueError, match="field is NoneType, expected a MapState or a Field"):
         extract_mesh(None)
-    field = field_of(square(0, np.eye(3), np.array([0.0, 0.0, 0.05])), (0, 0, 1))
-    for resolution in (1e-9, 1e-320):
-        with pytest.raises(ValueError, match="triangles, expected at most 50000000"):
-            extract_mesh(field, resolution)
+    plane = square(0, np.eye(3), np.array([0.0, 0.0, 0.05]))
+    for points in (plane, np.array([[0.01, 0.03, 0.05], [0.09, 0.03, 0.05]])):
+        for resolution in (1e-9, 1e-320):
+            with pytest.raises(ValueError, match="triangles, expected at most 50000000"):
+                extract_mesh(field_of(points, (0, 0, 1)), resolution)
 
 
 def test_an_empty_map_has_an_empty_mesh():

@@ -93,17 +93,17 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
 
     near = _points_near(patches, config.grid_shape)
     vertex, face = contouring.contour(near, function)
+    alone = as_rectangles(patches.part(function(patches.center).continued > _ALONE_VOXELS))
     coarsest = config.voxel_size / CELLS_PER_VOXEL
     halvings = max(0, math.ceil(math.log2(coarsest) - math.log2(spacing) - 1e-6))
-    triangles = len(face) * 4.0 ** min(halvings, 100)
+    triangles = (len(face) + 4 * len(alone.face)) * 4.0 ** min(halvings, 100)
     if triangles > _MOST_TRIANGLES:
         raise ValueError(
             f"resolution is {resolution} m, which needs {triangles:.3g} triangles, expected at "
             f"most {_MOST_TRIANGLES}"
         )
     whole = _refine(vertex, face, halvings, function)
-    is_alone = function(patches.center).continued > _ALONE_VOXELS
-    alone = _split(as_rectangles(patches.part(is_alone)), halvings + 1)
+    alone = _split(alone, halvings + 1)
     vertices = np.concatenate([whole.vertex, alone.vertex])
     return trimesh.Trimesh(
         ((vertices + config.corner_index) * config.voxel_size).astype(np.float32),

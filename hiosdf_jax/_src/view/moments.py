@@ -25,7 +25,7 @@ class Moment:
 
     Attributes:
         field: The snapshot.
-        mesh: Its surface, with triangles as large as its voxels.
+        mesh: Its surface, with the largest triangles that `extract_mesh` makes.
         cloud_world: (n, 3) m, the newest cloud; empty if there is none.
         sensor_world: (L, 2, 3) m, lines that outline the sensor.
         path_world: (F, 3) m, where the sensor has been.
