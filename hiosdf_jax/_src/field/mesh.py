@@ -118,8 +118,6 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
 
 def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
     """Marks the points of the lattice nearest to patches, and those beside them, bool."""
-    from scipy import ndimage
-
     most = np.multiply(shape, CELLS_PER_VOXEL)
     near = np.zeros(most + 1 + 2 * PADDING, bool)
     along = np.linspace(-1, 1, _MARKS)
@@ -128,7 +126,9 @@ def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
             mark = patches.center + a * patches.axes[:, 0] + b * patches.axes[:, 1]
             point = np.clip(np.rint(CELLS_PER_VOXEL * mark).astype(int), 0, most)
             near[tuple((point + PADDING).T)] = True
-    return ndimage.binary_dilation(near, np.ones((3, 3, 3)))
+    for axis in range(3):  # the outermost points are not marked, so nothing comes around
+        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+    return near
 
 
 def _refine(
