@@ -94,7 +94,7 @@ def test_a_square_is_one_flat_piece_without_holes(seed):
     beyond = np.abs(((found.triangles_center - center) @ turn)[:, :2]).max(axis=1) > 0.61
     assert found.area_faces[beyond].sum() < 0.02 * found.area
     # Narrow patches along the border are drawn once more.
-    assert found.area == pytest.approx(1.2**2, rel=0.04)
+    assert found.area == pytest.approx(1.2**2, rel=0.03)
     # Away from the border: covered everywhere, and once.
     inner = center + square(seed + 100, turn, 0.0, half=0.5, count=5_000)
     distance = distance_to(found, inner)
@@ -358,7 +358,7 @@ def test_hits_on_a_line_are_a_narrow_strip_that_faces_the_sensor():
         assert (high - low)[0] == pytest.approx(
             min(2 * 0.9 * 3**0.5 * points[:, 0].std(), VOXEL), abs=1e-3
         )
-        assert np.linalg.norm((high - low)[1:]) == pytest.approx(2 * 5e-3 * VOXEL, rel=0.25)
+        assert np.linalg.norm((high - low)[1:]) == pytest.approx(2 * 5e-3 * VOXEL, rel=0.1)
         np.testing.assert_allclose((low + high) / 2, points.mean(axis=0), atol=1e-3)
 
 
@@ -376,6 +376,8 @@ def test_a_strip_beside_a_plane_leaves_it_as_it_is():
     )
     assert len(both.faces) > len(alone.faces)
     assert both.area == pytest.approx(alone.area, rel=1e-2)
+    plane_areas = [m.area_faces[m.triangles_center[:, 0] < 0.15].sum() for m in (alone, both)]
+    assert plane_areas[1] == pytest.approx(plane_areas[0], rel=1e-3)
     assert distance_to_line(both.vertices[-4:], *line).max() < 1e-3  # the rectangle of the strip
 
 

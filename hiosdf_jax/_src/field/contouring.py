@@ -24,7 +24,6 @@ CELLS_PER_VOXEL = 2
 PADDING = 2
 """Points of the lattice beyond each face of the grid."""
 
-
 # Steps by which the end of the surface is found between two vertices.
 _BISECTIONS = 4
 
@@ -137,7 +136,7 @@ def _cut(
     count = kept[face].sum(axis=1)
 
     def with_one_apart(corners: int) -> np.ndarray:
-        """Returns the triangles with so many corners kept, the one on its own side first."""
+        """Returns the triangles with 1 or 2 kept corners, the only one of its kind first."""
         some = face[count == corners]
         apart = np.argmax(kept[some] == (corners == 1), axis=1)
         return np.take_along_axis(some, (apart[:, None] + [0, 1, 2]) % 3, axis=1)

@@ -1,7 +1,7 @@
 """The surface of a map as the zero level of a function: its patches, blended.
 
 A partition of unity weights the planes of the patches around a point (Ohtake et al., Multi-level
-Partition of Unity Implicits, SIGGRAPH 2003, section 3). The blend goes on beyond the patches, so a
+Partition of Unity Implicits, SIGGRAPH 2003, section 3). The blend extends beyond the patches, so a
 second function says where the surface ends.
 """
 
@@ -35,7 +35,7 @@ SAME_SHEET_VOXELS = 0.2
 Otherwise they are the two sides of a solid.
 """
 
-# The surface goes on beyond a patch by the first distance, voxels, and over gaps between two
+# The surface extends beyond a patch by the first distance, voxels, and over gaps between two
 # patches that are narrower than the second one. The patches lie on opposite sides of a point if the
 # angle between the directions to them has at most minus this cosine.
 _MARGIN_VOXELS = 0.05

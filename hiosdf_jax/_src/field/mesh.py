@@ -102,8 +102,10 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
             f"resolution is {resolution} m, which needs {triangles:.3g} triangles, expected at "
             f"most {_MOST_TRIANGLES}"
         )
-    whole = _refine(vertex, face, halvings, function)
-    alone = _split(alone, halvings + 1)
+    whole = _move_to_surface(*_split(vertex, face, halvings), function)
+    rows = np.column_stack([alone.vertex, alone.normal, alone.spread])
+    rows, face = _split(rows, alone.face, halvings + 1)  # their edges are a voxel long
+    alone = Triangles(rows[:, :3], rows[:, 3:6], rows[:, 6], face)
     vertices = np.concatenate([whole.vertex, alone.vertex])
     return trimesh.Trimesh(
         ((vertices + config.corner_index) * config.voxel_size).astype(np.float32),
@@ -126,43 +128,48 @@ def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
             mark = patches.center + a * patches.axes[:, 0] + b * patches.axes[:, 1]
             point = np.clip(np.rint(CELLS_PER_VOXEL * mark).astype(int), 0, most)
             near[tuple((point + PADDING).T)] = True
-    for axis in range(3):  # the outermost points are not marked, so nothing comes around
-        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+    for axis in range(3):
+        marked, before = (np.moveaxis(array, axis, 0) for array in (near, near.copy()))
+        marked[1:] |= before[:-1]
+        marked[:-1] |= before[1:]
     return near
 
 
-def _refine(
-    vertex: np.ndarray, face: np.ndarray, halvings: int, function: contouring.Function
+def _move_to_surface(
+    vertex: np.ndarray, face: np.ndarray, function: contouring.Function
 ) -> Triangles:
-    """Splits triangles, and moves their corners onto the surface.
+    """Moves the corners of triangles onto the surface.
 
     Args:
         vertex: (V, 3) voxels.
         face: Rows of vertices, (F, 3).
-        halvings: How often each triangle is split into four.
         function: Has the surface as its zero level.
 
     Returns:
         The triangles.
     """
-    import trimesh
-
-    for _ in range(halvings):
-        vertex, face = trimesh.remesh.subdivide(vertex, face)[:2]
     level = function(vertex)
     near = np.abs(level.height) < _MOVED_VOXELS
     height = np.where(near, level.height, 0)
     return Triangles(vertex - height[:, None] * level.normal, level.normal, level.spread, face)
 
 
-def _split(flat: Triangles, halvings: int) -> Triangles:
-    """Splits flat triangles into four, so many times."""
+def _split(rows: np.ndarray, face: np.ndarray, halvings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Splits each triangle into four, `halvings` times.
+
+    Args:
+        rows: Values of the vertices, interpolated at the new ones, (V, K).
+        face: Rows of vertices, (F, 3).
+        halvings: How often.
+
+    Returns:
+        The values (W, K) and the triangles (G, 3).
+    """
     import trimesh
 
-    rows, face = np.column_stack([flat.vertex, flat.normal, flat.spread]), flat.face
     for _ in range(halvings if len(face) else 0):
         rows, face = trimesh.remesh.subdivide(rows, face)[:2]
-    return Triangles(rows[:, :3], rows[:, 3:6], rows[:, 6], face)
+    return rows, face
 
 
 def _evaluate_in_chunks(config: Config, surface: Surface, positions: np.ndarray) -> Level:

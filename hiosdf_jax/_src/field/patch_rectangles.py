@@ -62,12 +62,11 @@ def as_rectangles(patches: Patches) -> Triangles:
     first, second, third = np.swapaxes(patches.axes, 0, 1)
     normal = np.cross(first, second)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    first, second = _widened(first), _widened(second)
     # The corners of a patch that turned with the noise lie outside of its voxel, where no hit was.
     room = 0.5 - np.abs(patches.center - np.floor(patches.center) - 0.5)
     reach = np.abs(first) + np.abs(second)
     scale = np.minimum(1, np.min(room / np.maximum(reach, 1e-12), axis=-1, keepdims=True))
-    first, second = scale * first, scale * second
+    first, second = _widened(scale * first), _widened(scale * second)
     corner = [a * first + b * second for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     vertex = (patches.center + np.stack(corner)).swapaxes(0, 1).reshape(-1, 3)
     start = 4 * np.arange(len(normal))[:, None]
