@@ -9,7 +9,7 @@ from room import HALF
 import hiosdf_jax as hio
 from hiosdf_jax._src.field import contouring, implicit_surface
 from hiosdf_jax._src.field.mesh import extract_mesh
-from hiosdf_jax._src.state.pytrees import NO_FEATURE
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side
 
 VOXEL = 0.1
 BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -262,7 +262,7 @@ def lattice(cells=20):
 
 
 def level_of(height, beyond, normal):
-    return implicit_surface.Level(height, beyond, normal, normal, height, height, height)
+    return implicit_surface.Level(height, beyond, normal, normal, height, height)
 
 
 @pytest.mark.parametrize("outward", [True, False])
@@ -360,6 +360,27 @@ def test_hits_on_a_line_are_a_narrow_strip_that_faces_the_sensor():
         )
         assert np.linalg.norm((high - low)[1:]) == pytest.approx(2 * 5e-3 * VOXEL, rel=0.1)
         np.testing.assert_allclose((low + high) / 2, points.mean(axis=0), atol=1e-3)
+
+
+def test_a_patch_beside_the_surface_is_drawn_in_free_space_only():
+    """One voxel's hits lie 3 cm above those of its neighbors."""
+    points = square(0, np.eye(3), np.array([0.0, 0.0, 0.03]))
+    above = (np.abs(points[:, :2] - 0.15) < 0.05).all(axis=1)
+    points[above, 2] += 0.03
+    field = field_of(points, (0, 0, 1))
+    derived = field.surface.derived
+    count = {}
+    for side in (Side.FREE, Side.SHEET, Side.PLANE, Side.BEHIND):
+        sides = np.full(derived.side.shape, side, np.int8)
+        surface = field.surface.replace(derived=derived.replace(side=sides))
+        found = extract_mesh(field.replace(surface=surface))
+        count[side] = len(found.faces)
+        beside = square(5, np.eye(3), np.array([-0.3, 0.0, 0.03]), half=0.2, count=500)
+        assert distance_to(found, beside).max() < 1e-3
+        if side in (Side.FREE, Side.SHEET):
+            middle = points[above & (np.linalg.norm(points[:, :2] - 0.15, axis=1) < 0.02)]
+            assert distance_to(found, middle).max() < 1e-3
+    assert count[Side.FREE] == count[Side.SHEET] > count[Side.PLANE] == count[Side.BEHIND]
 
 
 def test_a_hit_alone_has_no_surface():

@@ -165,5 +165,6 @@ def _cut(
             np.stack([de, f, df], axis=-1),
         ]
     )
-    used, face = np.unique(face, return_inverse=True)
-    return vertex[used], face.reshape(-1, 3)
+    used = np.zeros(len(vertex), bool)
+    used[face] = True
+    return vertex[used], (np.cumsum(used) - 1)[face]

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, lookup
-from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, split, unit
 from hiosdf_jax._src.state.pytrees import Surface
 
@@ -45,9 +44,6 @@ _ACROSS = 0.7
 # Farther from every patch, voxels, there is no surface.
 _FARTHEST_VOXELS = 0.45
 
-# A patch whose half extent along its shorter side is less, voxels, continues no other.
-_NARROW_VOXELS = 0.25
-
 _NONE = 9.0  # voxels; farther than anything
 
 
@@ -60,8 +56,6 @@ class Level(NamedTuple):
         normal: Of the blended planes, unit vectors, (..., 3).
         plane_normal: Of the nearest patch, unit vectors, (..., 3).
         plane_height: Above the plane of the nearest patch, (...) voxels.
-        continued: Distance from a patch, not a narrow one, that continues the plane of the nearest
-            patch, (...) voxels.
         spread: Standard deviation of the patches' hits along their normals, (...) voxels.
     """
 
@@ -70,7 +64,6 @@ class Level(NamedTuple):
     normal: Any
     plane_normal: Any
     plane_height: Any
-    continued: Any
     spread: Any
 
 
@@ -100,8 +93,7 @@ def evaluate(config: Config, surface: Surface, points_world: jax.Array) -> Level
         return jnp.take_along_axis(values, nearest[None], axis=0)[0]
 
     plane_normal, plane_height = each(of_nearest, patch.normal), of_nearest(patch.height)
-    cosine = _dot_each(patch.normal, plane_normal)
-    opposite = cosine < OPPOSITE_COSINE
+    opposite = _dot_each(patch.normal, plane_normal) < OPPOSITE_COSINE
     apart = jnp.abs(plane_height - _dot_each(patch.offset, plane_normal))
     same_sheet = apart < SAME_SHEET_VOXELS
     sign = jnp.where(opposite, -1, 1)
@@ -124,8 +116,6 @@ def evaluate(config: Config, surface: Surface, points_world: jax.Array) -> Level
     least = jnp.min(away, axis=0)
     beyond = jnp.maximum(beyond, least - _FARTHEST_VOXELS)
 
-    continues = (EXTENT_DEVIATIONS * patch.width >= _NARROW_VOXELS) & same_sheet
-    continues &= jnp.abs(cosine) > -OPPOSITE_COSINE
     some = least < _NONE
     return Level(
         jnp.where(some, height, 1),
@@ -133,7 +123,6 @@ def evaluate(config: Config, surface: Surface, points_world: jax.Array) -> Level
         join(normal),
         join(plane_normal),
         plane_height,
-        jnp.min(jnp.where(continues, away, _NONE), axis=0),
         jnp.sum(weight * patch.spread, axis=0),
     )
 

@@ -35,9 +35,16 @@ _CHUNK = 16384
 # About 10 GB while they are made.
 _MOST_TRIANGLES = 50_000_000
 
-# A patch this far from others that continue its plane, voxels, is drawn as a rectangle: the lattice
-# would miss it.
-_ALONE_VOXELS = 0.5
+# The center and the corners of a patch, in half edges.
+_CHECKED = ((0.0, 0.0), (-0.8, -0.8), (-0.8, 0.8), (0.8, -0.8), (0.8, 0.8))
+
+# A point of a patch is not on the contour if the nearest vertex is this far, voxels. Vertices are
+# half a voxel apart.
+_FAR_VOXELS = 0.5
+
+# Nor is it if it is this far above or below the contour, voxels. That counts in free space only:
+# where walls meet, the patches lie across the crease, and the contour is better.
+_OFF_VOXELS = 0.07
 
 # A shorter patch, voxels to each side, is a single hit and is not drawn.
 _LEAST_LENGTH = 5e-3
@@ -56,9 +63,9 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     The mesh is the zero level of a blend of the grid's surface patches. It has surfaces where rays
     ended, and closes gaps between them that are narrower than 0.6 voxels. A sheet that was seen
     from both sides, such as a door, is a single surface, or two if it is thicker than 0.2 voxels.
-    A patch without a neighbor in its plane, such as a part of a thin leg, is a rectangle. Returns
-    on a line in a voxel, such as two alone, make it 1 % of a voxel wide. Time and memory follow the
-    surface, but for 16 bytes per voxel.
+    A patch that the level misses, such as a part of a thin leg, is a rectangle in its voxel.
+    Returns on a line in a voxel, such as two alone, make it 1 % of a voxel wide. Time and memory
+    follow the surface, but for 16 bytes per voxel.
 
     Args:
         field: A map or a snapshot of one. The network has no part in the mesh.
@@ -92,18 +99,19 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     def function(position: np.ndarray) -> Level:
         return _evaluate_in_chunks(config, surface, position)
 
-    near = _points_near(patches, config.grid_shape)
-    vertex, face = contouring.contour(near, function)
-    alone = as_rectangles(patches.part(function(patches.center).continued > _ALONE_VOXELS))
+    vertex, face = contouring.contour(_points_near(patches, config.grid_shape), function)
     coarsest = config.voxel_size / CELLS_PER_VOXEL
     halvings = max(0, math.ceil(math.log2(coarsest) - math.log2(spacing) - 1e-6))
+    whole = _move_to_surface(vertex, face, function)
+    alone = as_rectangles(patches.part(_are_missed(patches, whole)))
     triangles = (len(face) + 4 * len(alone.face)) * 4.0 ** min(halvings, 100)
     if triangles > _MOST_TRIANGLES:
         raise ValueError(
             f"resolution is {resolution} m, which needs {triangles:.3g} triangles, expected at "
             f"most {_MOST_TRIANGLES}"
         )
-    whole = _move_to_surface(*_split(vertex, face, halvings), function)
+    if halvings:
+        whole = _move_to_surface(*_split(whole.vertex, face, halvings), function)
     rows = np.column_stack([alone.vertex, alone.normal, alone.spread])
     rows, face = _split(rows, alone.face, halvings + 1)  # their edges are a voxel long
     alone = Triangles(rows[:, :3], rows[:, 3:6], rows[:, 6], face)
@@ -134,6 +142,24 @@ def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
         marked[1:] |= before[:-1]
         marked[:-1] |= before[1:]
     return near
+
+
+def _are_missed(patches: Patches, contour: Triangles) -> np.ndarray:
+    """Returns a mask of the patches that are not on a contour, (M,) bool."""
+    from scipy.spatial import KDTree  # Imported here, so that the core needs no scipy.
+
+    if not len(contour.vertex):
+        return np.ones(len(patches.center), bool)
+    tree = KDTree(contour.vertex)
+    far, off = np.zeros((2, len(patches.center)), int)
+    for a, b in _CHECKED:
+        point = patches.center + a * patches.axes[:, 0] + b * patches.axes[:, 1]
+        distance, row = tree.query(point, workers=-1)
+        height = np.einsum("ij,ij->i", point - contour.vertex[row], contour.normal[row])
+        far += distance > _FAR_VOXELS
+        off += np.abs(height) > _OFF_VOXELS
+    # One corner may be a gap's or the border's.
+    return (far > 1) | (patches.in_free_space & (far + off > 0))
 
 
 def _move_to_surface(

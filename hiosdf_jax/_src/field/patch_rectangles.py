@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
-from hiosdf_jax._src.state.pytrees import NO_FEATURE, Surface
+from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side, Surface
 
 # A rectangle is at least this wide to each side, voxels, also if its hits lie on a line.
 _LEAST_HALF_EDGE = 5e-3
@@ -19,14 +19,17 @@ class Patches(NamedTuple):
     Attributes:
         center: Mean of the hits, (M, 3).
         axes: Half edges of the rectangle and half thickness, descending, (M, 3, 3).
+        in_free_space: There is free space around it or on both of its sides, as around a thin leg,
+            (M,) bool.
     """
 
     center: np.ndarray
     axes: np.ndarray
+    in_free_space: np.ndarray
 
     def part(self, kept: np.ndarray) -> Patches:
         """Returns the patches of a mask, (M,) bool."""
-        return Patches(self.center[kept], self.axes[kept])
+        return Patches(*(values[kept] for values in self))
 
 
 class Triangles(NamedTuple):
@@ -54,7 +57,9 @@ def find_patches(surface: Surface) -> Patches:
     used = np.zeros(nearest.shape[:3], bool)
     used[tuple((known + nearest[tuple(known.T)]).T)] = True
     center = np.argwhere(used) + 0.5 + mean[used].astype(float)
-    return Patches(center, EXTENT_DEVIATIONS * axes[used].astype(float))
+    side = np.asarray(surface.derived.side)[used]
+    in_free_space = (side == Side.FREE) | (side == Side.SHEET)
+    return Patches(center, EXTENT_DEVIATIONS * axes[used].astype(float), in_free_space)
 
 
 def as_rectangles(patches: Patches) -> Triangles:
