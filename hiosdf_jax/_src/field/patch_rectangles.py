@@ -17,15 +17,22 @@ class Patches(NamedTuple):
     """Surface patches, in voxels from the corner of the grid.
 
     Attributes:
+        voxel: Indices, (M, 3) int.
         center: Mean of the hits, (M, 3).
         axes: Half edges of the rectangle and half thickness, descending, (M, 3, 3).
         in_free_space: There is free space around it or on both of its sides, as around a thin leg,
             (M,) bool.
     """
 
+    voxel: np.ndarray
     center: np.ndarray
     axes: np.ndarray
     in_free_space: np.ndarray
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Principal axes of the hits, as long as their standard deviations, (M, 3, 3)."""
+        return self.axes / EXTENT_DEVIATIONS
 
     def part(self, kept: np.ndarray) -> Patches:
         """Returns the patches of a mask, (M,) bool."""
@@ -56,10 +63,20 @@ def find_patches(surface: Surface) -> Patches:
     known = np.argwhere(nearest[..., 0] != NO_FEATURE)
     used = np.zeros(nearest.shape[:3], bool)
     used[tuple((known + nearest[tuple(known.T)]).T)] = True
-    center = np.argwhere(used) + 0.5 + mean[used].astype(float)
+    voxel = np.argwhere(used)
+    center = voxel + 0.5 + mean[used].astype(float)
     side = np.asarray(surface.derived.side)[used]
     in_free_space = (side == Side.FREE) | (side == Side.SHEET)
-    return Patches(center, EXTENT_DEVIATIONS * axes[used].astype(float), in_free_space)
+    return Patches(voxel, center, EXTENT_DEVIATIONS * axes[used].astype(float), in_free_space)
+
+
+def with_patches(surface: Surface, patches: Patches) -> Surface:
+    """Puts patches into the surface in which they were found."""
+    mean, axes = (np.array(array) for array in (surface.mean, surface.axes))
+    row = tuple(patches.voxel.T)
+    mean[row] = patches.center - patches.voxel - 0.5
+    axes[row] = patches.deviations
+    return surface.replace(mean=mean, axes=axes)
 
 
 def as_rectangles(patches: Patches) -> Triangles:

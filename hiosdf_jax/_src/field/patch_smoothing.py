@@ -1,0 +1,148 @@
+"""Smooths the patches of a grid: each takes the plane through it and those that continue it.
+
+The normal of a single voxel's hits follows their noise, and where they straddle a face of voxels it
+tilts. The means of neighbors lie a voxel apart, so that a plane through all of them hardly does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from hiosdf_jax._src.field.patch_rectangles import Patches
+
+# A patch continues another one's plane if their normals have at least this cosine, and the center
+# of each is nearer to the other one's plane than the distance, voxels.
+_LEAST_COSINE = 0.9
+_FARTHEST_VOXELS = 0.2
+
+# Patches count by their area, and less with this distance from the first one, voxels.
+_NEAR_VOXELS = 0.6
+
+# Patches with a shorter edge, half of it in voxels, stay as they are: hits on a line have no plane.
+_LEAST_HALF_EDGE = 0.1
+
+
+def smooth(patches: Patches, shape: tuple[int, int, int]) -> Patches:
+    """Moves patches onto planes through the patches around them.
+
+    The plane of a patch is the principal one of the hits of up to 27 patches that continue it.
+
+    Args:
+        patches: At most one in each voxel.
+        shape: Of the grid.
+
+    Returns:
+        The patches in the same order, of the same sizes.
+    """
+    wide = np.linalg.norm(patches.axes[:, 1], axis=-1) > _LEAST_HALF_EDGE
+    center, axes = patches.center.copy(), patches.axes.copy()
+    center[wide], axes[wide] = _smooth(patches.part(wide), shape)
+    return patches._replace(center=center, axes=axes)
+
+
+def _smooth(patches: Patches, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the centers and axes of smoothed patches."""
+    normal = np.cross(patches.axes[:, 0], patches.axes[:, 1])
+    area = np.linalg.norm(normal, axis=-1)
+    normal /= area[:, None]
+    pairs = _find_pairs(patches, normal, shape)
+    normal = _plane_normals(patches, normal, area, pairs)
+    # The mean height of a neighbor above the patch's plane, and of the patch above the neighbor's.
+    # On a sphere it is 0.
+    total, height = area.copy(), np.zeros_like(area)
+    for pair in pairs:
+        for own, added, offset in pair.directions():
+            share = area[added] * pair.nearness
+            side = np.where(_dot(normal[own], normal[added]) < 0, -1, 1)
+            between = 0.5 * (normal[own] + side[:, None] * normal[added])
+            total[own] += share
+            height[own] += share * _dot(offset, between)
+    center = patches.center + (height / total)[:, None] * normal
+    return center, _turned(patches.axes, normal)
+
+
+class _Pairs(NamedTuple):
+    """Patches that continue each other, in one direction of the 13 to half of the neighbors.
+
+    Attributes:
+        one: Rows of the first patches, each at most once, (P,).
+        other: Rows of the second ones, (P,).
+        offset: From the first centers to the second ones, (P, 3) voxels.
+        nearness: Factor of the weight, (P,).
+    """
+
+    one: np.ndarray
+    other: np.ndarray
+    offset: np.ndarray
+    nearness: np.ndarray
+
+    def directions(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Yields rows, those of their neighbors, and the offsets, there and back."""
+        yield self.one, self.other, self.offset
+        yield self.other, self.one, -self.offset
+
+
+def _find_pairs(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int]) -> list[_Pairs]:
+    """Finds the patches in neighboring voxels that continue each other."""
+    pairs = []
+    for one, other in _neighbors(patches.voxel, shape):
+        offset = patches.center[other] - patches.center[one]
+        height = [_dot(offset, normal[row]) for row in (one, other)]
+        kept = np.max(np.abs(height), axis=0) < _FARTHEST_VOXELS
+        kept &= np.abs(_dot(normal[one], normal[other])) > _LEAST_COSINE
+        offset = offset[kept]
+        nearness = np.exp(-0.5 * _dot(offset, offset) / _NEAR_VOXELS**2)
+        pairs.append(_Pairs(one[kept], other[kept], offset, nearness))
+    return pairs
+
+
+def _plane_normals(
+    patches: Patches, normal: np.ndarray, area: np.ndarray, pairs: list[_Pairs]
+) -> np.ndarray:
+    """Computes the normals of planes through patches and those that continue them, (M, 3)."""
+    moment = np.einsum("mki,mkj->mij", patches.deviations, patches.deviations)
+    total, first, second = area.copy(), np.zeros_like(normal), area[:, None, None] * moment
+    for pair in pairs:
+        beside = pair.offset[:, :, None] * pair.offset[:, None, :]
+        for own, added, offset in pair.directions():
+            share = area[added] * pair.nearness
+            total[own] += share
+            first[own] += share[:, None] * offset
+            second[own] += share[:, None, None] * (moment[added] + beside)
+    mean = first / total[:, None]
+    spread = second / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
+    found = np.linalg.eigh(spread)[1][:, :, 0]
+    return found * np.where(_dot(found, normal) < 0, -1, 1)[:, None]
+
+
+def _neighbors(voxel: np.ndarray, shape: tuple[int, int, int]) -> list[tuple[np.ndarray, ...]]:
+    """Returns rows of voxels (M, 3) and of their neighbors, once per pair, for 13 directions."""
+    padded = np.add(shape, 2)
+    row = np.full(padded.prod(), -1, np.int32)
+    flat = np.ravel_multi_index(tuple((voxel + 1).T), padded)
+    row[flat] = np.arange(len(voxel))
+    pairs = []
+    for step in np.ndindex(3, 3, 3):
+        if step > (1, 1, 1):
+            beside = row[
+                flat + np.ravel_multi_index(step, padded) - np.ravel_multi_index((1, 1, 1), padded)
+            ]
+            first = np.flatnonzero(beside >= 0)
+            pairs.append((first, beside[first]))
+    return pairs
+
+
+def _turned(axes: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Turns axes (M, 3, 3) until the first two are perpendicular to a normal (M, 3)."""
+    size = np.linalg.norm(axes, axis=-1, keepdims=True)
+    along = axes[:, 0] - _dot(axes[:, 0], normal)[:, None] * normal
+    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+    return size * np.stack([along, np.cross(normal, along), normal], axis=1)
+
+
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Computes the scalar products of vectors (M, 3)."""
+    return np.einsum("ij,ij->i", one, other)
