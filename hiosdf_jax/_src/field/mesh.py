@@ -66,11 +66,12 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     """Extracts the observed surfaces of a map.
 
     The mesh is the zero level of a blend of the grid's surface patches, after each took the plane
-    through it and those that continue it. It has surfaces where rays ended, and closes gaps between them that are narrower than 0.6 voxels. A sheet that was seen
-    from both sides, such as a door, is a single surface, or two if it is thicker than 0.2 voxels.
-    A patch that the level misses, such as a part of a thin leg, is a rectangle in its voxel.
-    Returns on a line in a voxel, such as two alone, make it 1 % of a voxel wide. Time and memory
-    follow the surface, but for 50 bytes per voxel.
+    through it and those that continue it. It has surfaces where rays ended, and closes gaps between
+    them that are narrower than 0.6 voxels. A sheet that was seen from both sides, such as a door,
+    is a single surface, or two if it is thicker than 0.2 voxels. A patch that the level misses,
+    such as a part of a thin leg, is a rectangle in its voxel. Returns on a line in a voxel, such as
+    two alone, make it 1 % of a voxel wide. Time and memory follow the surface, but for 50 bytes per
+    voxel.
 
     Args:
         field: A map or a snapshot of one. The network has no part in the mesh.
