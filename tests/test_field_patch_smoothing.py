@@ -9,14 +9,16 @@ from hiosdf_jax._src.field.patch_smoothing import smooth
 SHAPE = (12, 11, 10)
 
 
-def patches_of(center, normal, rng=None, half=0.4):
+def patches_of(center, normal, rng=None, half=0.4, thickness=(0.01, 0.1)):
     """Patches around centers (M, 3) with normals (M, 3), their first axes at random."""
     rng = rng or np.random.default_rng(0)
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     along = np.cross(normal, rng.normal(size=normal.shape))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    size = np.broadcast_to([half, 0.8 * half, 0.02], (len(center), 3))[:, :, None]
-    axes = size * np.stack([along, np.cross(normal, along), normal], axis=1)
+    size = np.broadcast_arrays(half, 0.8 * half, rng.uniform(*thickness, len(center)))
+    axes = np.stack(size, axis=1)[:, :, None] * np.stack(
+        [along, np.cross(normal, along), normal], axis=1
+    )
     return Patches(np.floor(center).astype(int), center, axes, np.zeros(len(center), bool))
 
 
@@ -49,7 +51,8 @@ def slow(patches):
                 continue
             if np.abs(patches.voxel[j] - patches.voxel[i]).max() > 1 or abs(own[i] @ own[j]) <= 0.9:
                 continue
-            if max(abs(offset @ own[i]), abs(offset @ own[j])) < 0.2:
+            thickness = (half[i, 2] + half[j, 2]) / (0.9 * 3**0.5)
+            if max(abs(offset @ own[i]), abs(offset @ own[j])) < 0.2 + thickness:
                 yield j, area[j] * np.exp(-(offset @ offset) / (2 * 0.6**2))
 
     normal = own.copy()
@@ -115,6 +118,17 @@ def test_a_plane_stays_and_its_noise_falls():
     height = [np.abs(p.center[:, 2] - 4.6).mean() for p in (noisy, result)]
     assert tilt[1] < 0.6 * tilt[0]
     assert height[1] < 0.75 * height[0]
+
+
+def test_layers_of_voxels_join_where_their_patches_are_thick():
+    voxel = np.array([(x, y, z) for x in range(12) for y in range(11) for z in (4, 5)])
+    center = voxel + (0.5, 0.5, 0.5) + np.where(voxel[:, 2:] == 4, 0.35, -0.35) * (0, 0, 1)
+    for thickness, joins in ((0.05, False), (0.3, True)):
+        found = patches_of(
+            center, np.tile((0, 0, 1.0), (len(center), 1)), thickness=[thickness] * 2
+        )
+        spread = np.std(smooth(found, SHAPE).center[:, 2])
+        assert (spread < 0.05) if joins else (spread > 0.149)
 
 
 @pytest.mark.parametrize("radius", [4.0, 7.0])

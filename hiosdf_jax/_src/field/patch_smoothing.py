@@ -14,7 +14,8 @@ import numpy as np
 from hiosdf_jax._src.field.patch_rectangles import Patches
 
 # A patch continues another one's plane if their normals have at least this cosine, and the center
-# of each is nearer to the other one's plane than the distance, voxels.
+# of each is nearer to the other one's plane than the distance, voxels, and the standard deviations
+# of both along their normals: the noise of a wall may fill two layers of voxels.
 _LEAST_COSINE = 0.9
 _FARTHEST_VOXELS = 0.2
 
@@ -87,11 +88,13 @@ class _Pairs(NamedTuple):
 
 def _find_pairs(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int]) -> list[_Pairs]:
     """Finds the patches in neighboring voxels that continue each other."""
+    thickness = np.linalg.norm(patches.deviations[:, 2], axis=-1)
     pairs = []
     for one, other in _neighbors(patches.voxel, shape):
         offset = patches.center[other] - patches.center[one]
         height = [_dot(offset, normal[row]) for row in (one, other)]
-        kept = np.max(np.abs(height), axis=0) < _FARTHEST_VOXELS
+        farthest = _FARTHEST_VOXELS + thickness[one] + thickness[other]
+        kept = np.max(np.abs(height), axis=0) < farthest
         kept &= np.abs(_dot(normal[one], normal[other])) > _LEAST_COSINE
         offset = offset[kept]
         nearness = np.exp(-0.5 * _dot(offset, offset) / _NEAR_VOXELS**2)
