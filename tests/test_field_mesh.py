@@ -202,6 +202,8 @@ def slow_level(surface, points):
             thickness = np.linalg.norm(w)
             rank = np.linalg.norm(reach) + 3 * thickness
             known.append((rank, share * area, offset, normal, reach, thickness))
+        if any(patch[-1] < 0.25 for patch in known):
+            known = [patch for patch in known if patch[-1] < 0.25]
         if not known:
             rows.append((1.0, 9.0))
             continue
@@ -370,7 +372,7 @@ def test_a_patch_beside_the_surface_is_drawn_in_free_space_only():
     field = field_of(points, (0, 0, 1))
     derived = field.surface.derived
     count = {}
-    for side in (Side.FREE, Side.SHEET, Side.PLANE, Side.BEHIND):
+    for side in Side:
         sides = np.full(derived.side.shape, side, np.int8)
         surface = field.surface.replace(derived=derived.replace(side=sides))
         found = extract_mesh(field.replace(surface=surface))
@@ -380,7 +382,49 @@ def test_a_patch_beside_the_surface_is_drawn_in_free_space_only():
         if side in (Side.FREE, Side.SHEET):
             middle = points[above & (np.linalg.norm(points[:, :2] - 0.15, axis=1) < 0.02)]
             assert distance_to(found, middle).max() < 1e-3
-    assert count[Side.FREE] == count[Side.SHEET] > count[Side.PLANE] == count[Side.BEHIND]
+    assert count[Side.FREE] == count[Side.SHEET] > count[Side.PLANE]
+    assert count[Side.PLANE] == count[Side.BEHIND] == count[Side.UNKNOWN]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_of_a_wall_is_smoothed(seed):
+    """A centimeter of noise, 40 hits in each voxel; unsmoothed it is 3.5 degrees and 2 mm."""
+    points = square(seed, np.eye(3), np.array([0.0, 0.0, 0.04]), count=6_000)
+    points[:, 2] += np.random.default_rng(seed + 9).normal(0, 0.01, len(points))
+    found = extract_mesh(field_of(points, (0, 0, 1)))
+    inner = (np.abs(found.triangles_center[:, :2]) < 0.5).all(axis=1)
+    tilt = np.degrees(np.arccos(np.clip(found.face_normals[inner, 2], -1, 1)))
+    assert np.average(tilt, weights=found.area_faces[inner]) < 1.2
+    assert np.abs(found.vertices[:, 2] - 0.04).mean() < 1.2e-3
+
+
+def test_a_thin_solid_keeps_its_two_sides():
+    """A board of 3 cm across a face of voxels, with 8 mm of noise."""
+    rng = np.random.default_rng(0)
+    sides = []
+    for sign in (-1, 1):
+        points = square(sign + 1, np.eye(3), np.array([0.0, 0.0, 0.015 * sign]))
+        points[:, 2] += np.clip(rng.normal(0, 0.008, len(points)), -0.014, 0.014)
+        sides.append(field_of(points, (0, 0, sign)).surface)
+    whole = sides[0].replace(
+        mean=sides[0].mean + sides[1].mean,
+        axes=sides[0].axes + sides[1].axes,
+        derived=sides[0].derived.replace(
+            nearest=np.maximum(sides[0].derived.nearest, sides[1].derived.nearest)
+        ),
+    )
+    found = extract_mesh(field_of(np.zeros((1, 3)), (1, 2, 3)).replace(surface=whole))
+    assert found.area == pytest.approx(2 * 1.2**2, rel=0.05)
+    assert np.abs(found.vertices[:, 2]).mean() == pytest.approx(0.015, abs=2e-3)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_plane_at_the_border_of_the_grid_is_drawn_once(sign):
+    height = 0.999 * sign
+    points = square(0, np.eye(3), np.array([0.0, 0.0, height]))
+    found = extract_mesh(field_of(points, (0, 0, 0)))
+    assert found.area == pytest.approx(1.2**2, rel=0.03)
+    assert np.abs(found.vertices[:, 2] - height).max() < 1e-3
 
 
 def test_a_hit_alone_has_no_surface():

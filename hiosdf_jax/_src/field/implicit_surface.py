@@ -25,6 +25,10 @@ _SOFT_VOXELS = 0.3
 # patch of a voxel inside a wall, with stray hits of both sides, is thick and lies across.
 _THICKNESS = 3.0
 
+# A thicker patch, standard deviation in voxels, fills its voxel and has no plane: it counts only
+# where no other one is known.
+_FILLING_VOXELS = 0.25
+
 OPPOSITE_COSINE = -0.7
 """Patches whose normals have a smaller cosine face away from each other."""
 
@@ -84,6 +88,8 @@ def evaluate(config: Config, surface: Surface, points_world: jax.Array) -> Level
     point = split(points_world)
     corners = geometry.corners_of(config, point)
     patch = lookup.patches_at(config, surface, corners, point)
+    flat = patch.found & (patch.spread < _FILLING_VOXELS)
+    patch = patch._replace(found=jnp.where(jnp.any(flat, axis=0), flat, patch.found))
     away = jnp.where(patch.found, patch.distance, _NONE)
     # A thick patch counts as farther away.
     rank = away + _THICKNESS * patch.spread

@@ -45,8 +45,8 @@ _CHECKED = ((0.0, 0.0), (-0.8, -0.8), (-0.8, 0.8), (0.8, -0.8), (0.8, 0.8))
 # half a voxel apart.
 _FAR_VOXELS = 0.5
 
-# Nor is it if it is this far above or below the contour, voxels. That counts in free space only:
-# where walls meet, the patches lie across the crease, and the contour is better.
+# A point this far above or below the contour, voxels, is not on it either. That counts in free
+# space only: where walls meet, the patches lie across the crease, and the contour is better.
 _OFF_VOXELS = 0.07
 
 # A shorter patch, voxels to each side, is a single hit and is not drawn.
@@ -97,11 +97,12 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     if is_traced(*jax.tree.leaves(field)):
         raise ValueError("field is traced, expected a map: call extract_mesh outside jit")
     config, surface = field.config, field.surface
-    patches = smooth(find_patches(surface), config.grid_shape)
-    surface = jax.device_put(with_patches(surface, patches))
-    patches = patches.part(np.linalg.norm(patches.axes[:, 0], axis=-1) > _LEAST_LENGTH)
-    if not len(patches.center):
+    found = find_patches(surface)
+    found = found.part(np.linalg.norm(found.axes[:, 0], axis=-1) > _LEAST_LENGTH)
+    if not len(found.center):
         return trimesh.Trimesh()
+    patches = smooth(found, config.grid_shape)
+    surface = with_patches(surface, patches)
 
     def function(position: np.ndarray) -> Level:
         return _evaluate_in_chunks(config, surface, position)
@@ -110,7 +111,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     coarsest = config.voxel_size / CELLS_PER_VOXEL
     halvings = max(0, math.ceil(math.log2(coarsest) - math.log2(spacing) - 1e-6))
     whole = _move_to_surface(vertex, face, function)
-    alone = as_rectangles(patches.part(_are_missed(patches, whole)))
+    alone = as_rectangles(found.part(_are_missed(patches, whole)))
     triangles = (len(face) + 4 * len(alone.face)) * 4.0 ** min(halvings, 100)
     if triangles > _MOST_TRIANGLES:
         raise ValueError(
@@ -138,13 +139,11 @@ def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
     """Marks the corners of the cells of the lattice in which patches lie, bool."""
     most = np.multiply(shape, CELLS_PER_VOXEL)
     near = np.zeros(most + 1 + 2 * PADDING, bool)
-    normal = np.cross(patches.axes[:, 0], patches.axes[:, 1])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    along = np.linspace(-1, 1, _MARKS)
+    beside, along = _BESIDE_VOXELS * patches.normal, np.linspace(-1, 1, _MARKS)
     for a, b, c in itertools.product(along, along, (-1, 1)):
         mark = patches.center + a * patches.axes[:, 0] + b * patches.axes[:, 1]
-        mark += c * _BESIDE_VOXELS * normal
-        cell = np.clip(np.floor(CELLS_PER_VOXEL * mark).astype(int), -1, most)
+        mark += c * beside
+        cell = np.clip(np.floor(CELLS_PER_VOXEL * mark).astype(int), 0, most - 1)
         near[tuple((cell + PADDING).T)] = True
     for axis in range(3):
         marked, before = (np.moveaxis(array, axis, 0) for array in (near, near.copy()))
@@ -154,7 +153,7 @@ def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
 
 def _are_missed(patches: Patches, contour: Triangles) -> np.ndarray:
     """Returns a mask of the patches that are not on a contour, (M,) bool."""
-    from scipy.spatial import KDTree  # Imported here, so that the core needs no scipy.
+    from scipy.spatial import KDTree
 
     if not len(contour.vertex):
         return np.ones(len(patches.center), bool)

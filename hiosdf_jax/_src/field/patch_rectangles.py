@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
@@ -28,6 +29,12 @@ class Patches(NamedTuple):
     center: np.ndarray
     axes: np.ndarray
     in_free_space: np.ndarray
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit vectors toward the sensor's side, (M, 3)."""
+        across = np.cross(self.axes[:, 0], self.axes[:, 1])
+        return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
 
     @property
     def deviations(self) -> np.ndarray:
@@ -71,25 +78,26 @@ def find_patches(surface: Surface) -> Patches:
 
 
 def with_patches(surface: Surface, patches: Patches) -> Surface:
-    """Puts patches into the surface in which they were found."""
+    """Puts patches into the surface in which they were found, on its device."""
     mean, axes = (np.array(array) for array in (surface.mean, surface.axes))
     row = tuple(patches.voxel.T)
     mean[row] = patches.center - patches.voxel - 0.5
     axes[row] = patches.deviations
+    places = [getattr(array, "sharding", None) for array in (surface.mean, surface.axes)]
+    mean, axes = jax.device_put([mean, axes], places)
     return surface.replace(mean=mean, axes=axes)
 
 
 def as_rectangles(patches: Patches) -> Triangles:
     """Draws patches as rectangles inside their voxels, two triangles each."""
     first, second, third = np.swapaxes(patches.axes, 0, 1)
-    normal = np.cross(first, second)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     # The corners of a patch that turned with the noise lie outside of its voxel, where no hit was.
     room = 0.5 - np.abs(patches.center - np.floor(patches.center) - 0.5)
     reach = np.abs(first) + np.abs(second)
     scale = np.minimum(1, np.min(room / np.maximum(reach, 1e-12), axis=-1, keepdims=True))
     first, second = _widened(scale * first), _widened(scale * second)
     corner = [a * first + b * second for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    normal = patches.normal
     vertex = (patches.center + np.stack(corner)).swapaxes(0, 1).reshape(-1, 3)
     start = 4 * np.arange(len(normal))[:, None]
     face = np.concatenate([start + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])

@@ -1,7 +1,7 @@
 """Smooths the patches of a grid: each takes the plane through it and those that continue it.
 
-The normal of a single voxel's hits follows their noise, and where they straddle a face of voxels it
-tilts. The means of neighbors lie a voxel apart, so that a plane through all of them hardly does.
+The normal of a single voxel's hits follows their noise, and tilts where they straddle a face of
+voxels. A plane through the means of neighbors, which lie a voxel apart, hardly tilts.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ import numpy as np
 from hiosdf_jax._src.field.patch_rectangles import Patches
 
 # A patch continues another one's plane if their normals have at least this cosine, and the center
-# of each is nearer to the other one's plane than the distance, voxels, and the standard deviations
-# of both along their normals: the noise of a wall may fill two layers of voxels.
+# of each is nearer to the other one's plane than the distance, voxels. On the same side of a wall,
+# whose noise may fill two layers of voxels, the standard deviations of both along their normals are
+# added. No smoothed normal turns by more either.
 _LEAST_COSINE = 0.9
 _FARTHEST_VOXELS = 0.2
 
-# Patches count by their area, and less with this distance from the first one, voxels.
+# A patch's weight is its area times a Gaussian of its distance with this deviation, voxels.
 _NEAR_VOXELS = 0.6
 
 # Patches with a shorter edge, half of it in voxels, stay as they are: hits on a line have no plane.
-_LEAST_HALF_EDGE = 0.1
+_LEAST_SMOOTHED = 0.1
 
 
 def smooth(patches: Patches, shape: tuple[int, int, int]) -> Patches:
@@ -38,7 +39,7 @@ def smooth(patches: Patches, shape: tuple[int, int, int]) -> Patches:
     Returns:
         The patches in the same order, of the same sizes.
     """
-    wide = np.linalg.norm(patches.axes[:, 1], axis=-1) > _LEAST_HALF_EDGE
+    wide = np.linalg.norm(patches.axes[:, 1], axis=-1) > _LEAST_SMOOTHED
     center, axes = patches.center.copy(), patches.axes.copy()
     center[wide], axes[wide] = _smooth(patches.part(wide), shape)
     return patches._replace(center=center, axes=axes)
@@ -46,9 +47,8 @@ def smooth(patches: Patches, shape: tuple[int, int, int]) -> Patches:
 
 def _smooth(patches: Patches, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the centers and axes of smoothed patches."""
-    normal = np.cross(patches.axes[:, 0], patches.axes[:, 1])
-    area = np.linalg.norm(normal, axis=-1)
-    normal /= area[:, None]
+    normal = patches.normal
+    area = np.prod(np.linalg.norm(patches.axes[:, :2], axis=-1), axis=-1)
     pairs = _find_pairs(patches, normal, shape)
     normal = _plane_normals(patches, normal, area, pairs)
     # The mean height of a neighbor above the patch's plane, and of the patch above the neighbor's.
@@ -93,9 +93,9 @@ def _find_pairs(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int
     for one, other in _neighbors(patches.voxel, shape):
         offset = patches.center[other] - patches.center[one]
         height = [_dot(offset, normal[row]) for row in (one, other)]
-        farthest = _FARTHEST_VOXELS + thickness[one] + thickness[other]
-        kept = np.max(np.abs(height), axis=0) < farthest
-        kept &= np.abs(_dot(normal[one], normal[other])) > _LEAST_COSINE
+        cosine = _dot(normal[one], normal[other])
+        farthest = _FARTHEST_VOXELS + np.where(cosine > 0, thickness[one] + thickness[other], 0)
+        kept = (np.max(np.abs(height), axis=0) < farthest) & (np.abs(cosine) > _LEAST_COSINE)
         offset = offset[kept]
         nearness = np.exp(-0.5 * _dot(offset, offset) / _NEAR_VOXELS**2)
         pairs.append(_Pairs(one[kept], other[kept], offset, nearness))
@@ -118,7 +118,10 @@ def _plane_normals(
     mean = first / total[:, None]
     spread = second / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
     found = np.linalg.eigh(spread)[1][:, :, 0]
-    return found * np.where(_dot(found, normal) < 0, -1, 1)[:, None]
+    cosine = _dot(found, normal)
+    found *= np.where(cosine < 0, -1, 1)[:, None]
+    # The principal plane of a column of narrow patches may lie across them.
+    return np.where(np.abs(cosine)[:, None] > _LEAST_COSINE, found, normal)
 
 
 def _neighbors(voxel: np.ndarray, shape: tuple[int, int, int]) -> list[tuple[np.ndarray, ...]]:
