@@ -202,8 +202,8 @@ def slow_level(surface, points):
             thickness = np.linalg.norm(w)
             rank = np.linalg.norm(reach) + 3 * thickness
             known.append((rank, share * area, offset, normal, reach, thickness))
-        if any(patch[-1] < 0.25 for patch in known):
-            known = [patch for patch in known if patch[-1] < 0.25]
+        if any(patch[-1] < 0.2 for patch in known):
+            known = [patch for patch in known if patch[-1] < 0.2]
         if not known:
             rows.append((1.0, 9.0))
             continue
@@ -324,21 +324,29 @@ def test_a_gap_is_closed_if_it_is_narrow():
         assert (distance.max() < 1e-3) if closed else (distance.min() > 0.05)
 
 
-def test_stray_hits_inside_a_wall_leave_its_sides_whole():
-    """A wall of one voxel, seen from both sides, with stray hits of both in its middle."""
+@pytest.mark.parametrize("across", [False, True])
+def test_stray_hits_inside_a_wall_leave_its_sides_whole(across):
+    """A wall of one voxel, seen from both sides, with stray hits of both in its middle.
+
+    If the patches of stray hits lie across, the voxels of both sides know them, not their own.
+    """
     rng = np.random.default_rng(0)
     sides = [square(k, np.eye(3), np.array([0.0, 0.0, z])) for k, z in enumerate((-0.005, 0.105))]
-    stray = rng.uniform([-0.6, -0.6, 0.001], [0.6, 0.6, 0.099], (4_000, 3))
+    stray = rng.uniform([-0.6, -0.6, 0.001], [0.6, 0.6, 0.099], (12_000, 3))
     low, high = field_of(sides[0], (0, 0, -1)), field_of(sides[1], (0, 0, 1))
     inside = field_of(stray, (1.0, 0.3, 0.05))
     surfaces = [field.surface for field in (low, high, inside)]
+    nearest = np.max([s.derived.nearest for s in surfaces], axis=0)
+    if across:
+        middle = -low.config.corner_index[2]
+        for layer, step in ((-2, 1), (-1, 1), (1, -1), (2, -1)):
+            known = nearest[:, :, middle, 0] != NO_FEATURE
+            nearest[known, middle + layer] = (0, 0, step)
     whole = low.replace(
         surface=surfaces[0].replace(
             mean=sum(s.mean for s in surfaces),
             axes=sum(s.axes for s in surfaces),
-            derived=surfaces[0].derived.replace(
-                nearest=np.max([s.derived.nearest for s in surfaces], axis=0)
-            ),
+            derived=surfaces[0].derived.replace(nearest=nearest),
         )
     )
     found = extract_mesh(whole)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from hiosdf_jax._src.config import Config
+from hiosdf_jax._src.field.patch_rectangles import FILLING_VOXELS
 from hiosdf_jax._src.grid import geometry, lookup
 from hiosdf_jax._src.numerics.vectors import Vector, dot, each, join, length, split, unit
 from hiosdf_jax._src.state.pytrees import Surface
@@ -24,10 +25,6 @@ _SOFT_VOXELS = 0.3
 # This many standard deviations of a patch's hits along its normal count as distance from it. The
 # patch of a voxel inside a wall, with stray hits of both sides, is thick and lies across.
 _THICKNESS = 3.0
-
-# A thicker patch, standard deviation in voxels, fills its voxel and has no plane: it counts only
-# where no other one is known.
-_FILLING_VOXELS = 0.25
 
 OPPOSITE_COSINE = -0.7
 """Patches whose normals have a smaller cosine face away from each other."""
@@ -88,7 +85,8 @@ def evaluate(config: Config, surface: Surface, points_world: jax.Array) -> Level
     point = split(points_world)
     corners = geometry.corners_of(config, point)
     patch = lookup.patches_at(config, surface, corners, point)
-    flat = patch.found & (patch.spread < _FILLING_VOXELS)
+    # Patches that fill their voxels count only where no others are known.
+    flat = patch.found & (patch.spread < FILLING_VOXELS)
     patch = patch._replace(found=jnp.where(jnp.any(flat, axis=0), flat, patch.found))
     away = jnp.where(patch.found, patch.distance, _NONE)
     # A thick patch counts as farther away.

@@ -70,7 +70,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     them that are narrower than 0.6 voxels. A sheet that was seen from both sides, such as a door,
     is a single surface, or two if it is thicker than 0.2 voxels. A patch that the level misses,
     such as a part of a thin leg, is a rectangle in its voxel. Returns on a line in a voxel, such as
-    two alone, make it 1 % of a voxel wide. Time and memory follow the surface, but for 50 bytes per
+    two alone, make it 1 % of a voxel wide. Time and memory follow the surface, but for 55 bytes per
     voxel.
 
     Args:

@@ -10,6 +10,9 @@ import numpy as np
 from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
 from hiosdf_jax._src.state.pytrees import NO_FEATURE, Side, Surface
 
+FILLING_VOXELS = 0.2
+"""A thicker patch, standard deviation in voxels, fills its voxel and has no plane."""
+
 # A rectangle is at least this wide to each side, voxels, also if its hits lie on a line.
 _LEAST_HALF_EDGE = 5e-3
 
@@ -78,14 +81,26 @@ def find_patches(surface: Surface) -> Patches:
 
 
 def with_patches(surface: Surface, patches: Patches) -> Surface:
-    """Puts patches into the surface in which they were found, on its device."""
-    mean, axes = (np.array(array) for array in (surface.mean, surface.axes))
+    """Puts patches into the surface in which they were found, on its device.
+
+    Where a voxel with a patch knows one that fills another voxel, it knows its own instead: a patch
+    inside a thin wall may lie across, and nearer to the centers of voxels than the wall's sides.
+    """
+    arrays = surface.mean, surface.axes, surface.derived.nearest
+    mean, axes, nearest = (np.array(array) for array in arrays)
     row = tuple(patches.voxel.T)
     mean[row] = patches.center - patches.voxel - 0.5
     axes[row] = patches.deviations
-    places = [getattr(array, "sharding", None) for array in (surface.mean, surface.axes)]
-    mean, axes = jax.device_put([mean, axes], places)
-    return surface.replace(mean=mean, axes=axes)
+    fills = np.zeros(nearest.shape[:3], bool)
+    fills[row] = np.linalg.norm(patches.deviations[:, 2], axis=-1) >= FILLING_VOXELS
+    own = patches.voxel[~fills[row]]
+    own = own[nearest[tuple(own.T)][:, 0] != NO_FEATURE]
+    own = own[fills[tuple((own + nearest[tuple(own.T)]).T)]]
+    nearest[tuple(own.T)] = 0
+    places = [getattr(array, "sharding", None) for array in arrays]
+    mean, axes, nearest = jax.device_put([mean, axes, nearest], places)
+    derived = surface.derived.replace(nearest=nearest)
+    return surface.replace(mean=mean, axes=axes, derived=derived)
 
 
 def as_rectangles(patches: Patches) -> Triangles:
