@@ -44,6 +44,11 @@ class Patches(NamedTuple):
         """Principal axes of the hits, as long as their standard deviations, (M, 3, 3)."""
         return self.axes / EXTENT_DEVIATIONS
 
+    @property
+    def thickness(self) -> np.ndarray:
+        """Standard deviation of the hits along the normal, (M,)."""
+        return np.linalg.norm(self.axes[:, 2], axis=-1) / EXTENT_DEVIATIONS
+
     def part(self, kept: np.ndarray) -> Patches:
         """Returns the patches of a mask, (M,) bool."""
         return Patches(*(values[kept] for values in self))
@@ -92,7 +97,7 @@ def with_patches(surface: Surface, patches: Patches) -> Surface:
     mean[row] = patches.center - patches.voxel - 0.5
     axes[row] = patches.deviations
     fills = np.zeros(nearest.shape[:3], bool)
-    fills[row] = np.linalg.norm(patches.deviations[:, 2], axis=-1) >= FILLING_VOXELS
+    fills[row] = patches.thickness >= FILLING_VOXELS
     own = patches.voxel[~fills[row]]
     own = own[nearest[tuple(own.T)][:, 0] != NO_FEATURE]
     own = own[fills[tuple((own + nearest[tuple(own.T)]).T)]]
@@ -105,7 +110,7 @@ def with_patches(surface: Surface, patches: Patches) -> Surface:
 
 def as_rectangles(patches: Patches) -> Triangles:
     """Draws patches as rectangles inside their voxels, two triangles each."""
-    first, second, third = np.swapaxes(patches.axes, 0, 1)
+    first, second = patches.axes[:, 0], patches.axes[:, 1]
     # The corners of a patch that turned with the noise lie outside of its voxel, where no hit was.
     room = 0.5 - np.abs(patches.center - np.floor(patches.center) - 0.5)
     reach = np.abs(first) + np.abs(second)
@@ -116,8 +121,7 @@ def as_rectangles(patches: Patches) -> Triangles:
     vertex = (patches.center + np.stack(corner)).swapaxes(0, 1).reshape(-1, 3)
     start = 4 * np.arange(len(normal))[:, None]
     face = np.concatenate([start + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])
-    spread = np.linalg.norm(third, axis=-1) / EXTENT_DEVIATIONS
-    return Triangles(vertex, np.repeat(normal, 4, axis=0), np.repeat(spread, 4), face)
+    return Triangles(vertex, np.repeat(normal, 4, axis=0), np.repeat(patches.thickness, 4), face)
 
 
 def _widened(half_edge: np.ndarray) -> np.ndarray:

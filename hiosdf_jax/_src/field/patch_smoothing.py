@@ -88,8 +88,7 @@ class _Pairs(NamedTuple):
 
 def _find_pairs(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int]) -> list[_Pairs]:
     """Finds the patches in neighboring voxels that continue each other."""
-    thickness = np.linalg.norm(patches.deviations[:, 2], axis=-1)
-    pairs = []
+    thickness, pairs = patches.thickness, []
     for one, other in _neighbors(patches.voxel, shape):
         offset = patches.center[other] - patches.center[one]
         height = [_dot(offset, normal[row]) for row in (one, other)]
@@ -106,7 +105,8 @@ def _plane_normals(
     patches: Patches, normal: np.ndarray, area: np.ndarray, pairs: list[_Pairs]
 ) -> np.ndarray:
     """Computes the normals of planes through patches and those that continue them, (M, 3)."""
-    moment = np.einsum("mki,mkj->mij", patches.deviations, patches.deviations)
+    deviations = patches.deviations
+    moment = np.einsum("mki,mkj->mij", deviations, deviations)
     total, first, second = area.copy(), np.zeros_like(normal), area[:, None, None] * moment
     for pair in pairs:
         beside = pair.offset[:, :, None] * pair.offset[:, None, :]
