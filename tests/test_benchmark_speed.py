@@ -320,7 +320,7 @@ def test_work_is_what_xla_counts():
 
 def test_the_distance_transform_s_work_is_what_xla_is_given(monkeypatch):
     # Without a loop, whose work XLA counts once.
-    monkeypatch.setattr(loops, "_ROUNDS_PER_STEP", 12)
+    monkeypatch.setattr(loops, "_MOST_PER_STEP", 12)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     window = Window((5, 0, 0), (30, 30, 20), (8, 2, 0), (20, 24, 20))
     part = nearest.Part(window.within, window.inner_shape)

@@ -70,9 +70,10 @@ def numpy_transforms(sites, offset, horizon, part, order=(2, 1, 0)):
 )
 @pytest.mark.parametrize(("share", "horizon"), [(0.0005, 9), (0.0005, 16), (0.002, 25), (0.02, 40)])
 def test_axis_transforms_against_numpy(monkeypatch, share, horizon, device, number):
-    """With many blocks, one block, and shifts of a loop's step that do or do not divide all."""
-    where, name = (nearest, "_BLOCK") if device == "cpu" else (loops, "_ROUNDS_PER_STEP")
+    """On all cores or one, and with shifts of a loop's step that do or do not divide all."""
+    where, name = (nearest, "_BLOCK") if device == "cpu" else (loops, "_MOST_PER_STEP")
     monkeypatch.setattr(where, name, number)
+    monkeypatch.setattr(loops, "_LEAST_TO_SHARE", number)
     monkeypatch.setattr(jax, "default_backend", lambda: device)
     rng = np.random.default_rng(11)
     sites = rng.random((40, 21, 13)) < share

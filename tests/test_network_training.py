@@ -277,3 +277,15 @@ def test_the_schedule_warms_up_and_queries_never_use_the_untrained_network():
     # A changed world: old weights count less.
     changed = [float(training.schedule(config, jnp.int32(n), 0.02)[1]) for n in (0, 1, 2, 6)]
     np.testing.assert_allclose(changed, [0, 0.5, 0.5, 0.5], atol=1e-6)
+
+
+def test_the_median_of_residuals_is_numpy_s():
+    rng = np.random.default_rng(4)
+    for count in (1, 2, 3, 50, 101):
+        for digits in (1, 6):  # with and without ties
+            values = np.round(rng.normal(size=count), digits).astype(np.float32)
+            weight = (rng.random(count) < 0.7).astype(np.float32)
+            expected = np.median(values[weight > 0]) if weight.any() else 0
+            assert training._median(jnp.asarray(values), jnp.asarray(weight)) == expected
+    values, weight = jnp.array([3.0, -2.0, 5.0, 1.0, 9.0]), jnp.array([1.0, 1.0, 1.0, 1.0, 0.0])
+    np.testing.assert_array_equal(jax.grad(training._median)(values, weight), [0.5, 0, 0, 0.5, 0])

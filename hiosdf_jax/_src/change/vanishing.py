@@ -14,7 +14,6 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry, patches
 from hiosdf_jax._src.grid.evidence import EvidenceWindow, clear_patches
 from hiosdf_jax._src.grid.rays import Rays
-from hiosdf_jax._src.numerics.loops import rounds_per_step
 from hiosdf_jax._src.numerics.masks import first_true_indices
 from hiosdf_jax._src.numerics.modes import run_if
 from hiosdf_jax._src.numerics.shifts import with_neighbors
@@ -133,7 +132,7 @@ def drop_vanished(
             remains = (count >= least) & most
             return vanished | (remains & ((crossed > 0) | looked_past))
 
-        return jax.lax.fori_loop(0, _SPREADS, once, vanished, unroll=rounds_per_step(_SPREADS))
+        return jax.lax.fori_loop(0, _SPREADS, once, vanished)
 
     many = jnp.sum(change < _FORGOTTEN) >= _LEAST_GONE_IF_MET
     vanished = run_if(many, spread, vanished, window, rays)

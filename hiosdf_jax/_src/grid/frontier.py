@@ -10,7 +10,7 @@ from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import is_observed
 from hiosdf_jax._src.grid.windows import RayBox, Window, recompute, whole_grid
-from hiosdf_jax._src.numerics.loops import rounds_per_step
+from hiosdf_jax._src.numerics.loops import on_all_cores, rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.state.pytrees import FRONTIER_STEPS, Grid, frontier_step_m
@@ -47,6 +47,7 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
     to_inside = pad_axis(jnp.where(inside, 0, squared), axis, reach, _INFINITE).computed_once()
 
     def compare(k: jax.Array, best: jax.Array) -> jax.Array:
+        k = on_all_cores(k, squared.size)
         for step in (-k, k):
             across = jnp.where(inside, to_outside.shifted(step), to_inside.shifted(step))
             best = jnp.minimum(best, across + (k.astype(jnp.float32) - 0.5) ** 2)
@@ -54,7 +55,7 @@ def _transform_axis(inside: jax.Array, squared: jax.Array, axis: int, reach: int
 
     start = varying_like(squared, inside)
     return jax.lax.fori_loop(
-        np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step()
+        np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step(reach)
     )
 
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.loops import rounds_per_step
+from hiosdf_jax._src.numerics.loops import on_all_cores, rounds_per_step
 from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.shifts import pad_axis
 from hiosdf_jax._src.numerics.vectors import dot, each, split
@@ -23,9 +23,11 @@ from hiosdf_jax._src.numerics.vectors import dot, each, split
 _INFINITE = 1e12  # squared voxels
 
 # A CPU transforms blocks of about this many voxels one after the other, so that they stay in its
-# cache. Half and twice as many are as fast; all at once take 1.5 times as long. A GPU transforms
-# all voxels at once.
-_BLOCK = 12_000
+# cache: large blocks on all cores, and the small ones of a smaller array on one core. Half and
+# twice as many voxels are as fast. On two cores, the sites of 2 x 196 x 123 x 35 voxels take 47 ms,
+# with small blocks 100 ms and all at once 170 ms. A GPU transforms all voxels at once.
+_BLOCK = 200_000
+_SMALL_BLOCK = 12_000
 
 
 class Part(NamedTuple):
@@ -164,7 +166,7 @@ def _by_blocks(
         return find(squared, along)
     rows = squared.shape
     across = 0 if rows[0] >= rows[2] else 2  # the axis to divide into blocks
-    blocks = -(-squared.size // _BLOCK)
+    blocks = -(-squared.size // (_BLOCK if squared.size > _BLOCK else _SMALL_BLOCK))
     size = -(-rows[across] // min(blocks, rows[across]))
     blocks = -(-rows[across] // size)
 
@@ -212,12 +214,13 @@ def _find_nearest(
         return _with_shift(moved, shift, reach)
 
     def compare(k: jax.Array, best: jax.Array) -> jax.Array:
+        k = on_all_cores(k, squared.size)
         return jnp.minimum(best, jnp.minimum(candidate(-k), candidate(k)))
 
     own = jax.lax.dynamic_slice_in_dim(squared, first, length, 1)
     start = varying_like(_with_shift(own, jnp.int32(0), reach), squared, along)
     return jax.lax.fori_loop(
-        np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step()
+        np.int32(1), np.int32(reach + 1), compare, start, unroll=rounds_per_step(reach)
     )
 
 

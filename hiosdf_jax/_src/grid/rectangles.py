@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.nearest import Part
 from hiosdf_jax._src.numerics.barriers import compute_once
-from hiosdf_jax._src.numerics.shifts import pad_axis
+from hiosdf_jax._src.numerics.loops import on_all_cores, rounds_per_step
+from hiosdf_jax._src.numerics.modes import varying_like
 from hiosdf_jax._src.numerics.vectors import dot, each, take
 
 # Half extents of the rectangles that are compared, in standard deviations: half of a patch's. At
@@ -84,13 +86,17 @@ def nearest_rectangles(
             square += share * (share * size - 2 * dot(offset, half))
         return jnp.where(counts, square, jnp.inf)
 
-    for axis in range(3):
-        padded = pad_axis(nearest, axis, REACH_VOXELS, -1)
+    def along(axis: jax.Array, nearest: jax.Array) -> jax.Array:
+        axis = on_all_cores(axis, nearest.size)
+        padded = compute_once(jnp.pad(nearest, REACH_VOXELS, constant_values=-1))
         best, least = nearest, squared_distance(nearest)
         for step in (-1, 1):
-            other = padded.shifted(step)
+            start = [REACH_VOXELS + jnp.where(axis == k, step, 0) for k in range(3)]
+            other = jax.lax.dynamic_slice(padded, start, nearest.shape)
             square = squared_distance(other)
             nearer = square < least - _LEAST_GAIN
             best, least = jnp.where(nearer, other, best), jnp.where(nearer, square, least)
-        nearest = compute_once(jnp.where(nearest >= 0, best, -1))
-    return nearest
+        return jnp.where(nearest >= 0, best, -1)
+
+    start = varying_like(nearest, mean, axes)
+    return jax.lax.fori_loop(np.int32(0), np.int32(3), along, start, unroll=rounds_per_step(3))

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hiosdf_jax._src.numerics.barriers import hold
+from hiosdf_jax._src.numerics.barriers import compute_once, hold
 from hiosdf_jax._src.numerics.modes import varying_like
 
 WORD = 32  # bits
@@ -100,7 +100,8 @@ def indices_of_true(mask: RankedMask, number: jax.Array) -> jax.Array:
     words, rank = mask
     row = jnp.minimum(count_below(rank, number + 1), words.size - 1)
     before = jnp.where(row > 0, rank[row - 1], 0)
-    return WORD * row + _nth_bit(words[row], number - before)
+    # Once, and not in each kernel that gathers at these indices.
+    return compute_once(WORD * row + _nth_bit(words[row], number - before))
 
 
 def first_true_indices(mask: jax.Array, count: int) -> jax.Array:

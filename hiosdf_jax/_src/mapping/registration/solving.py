@@ -173,7 +173,7 @@ def solve_coarse(
         best, least, number = carry
         start = move(pose, motions[number]), no_sums()
         found, sums = jax.lax.fori_loop(
-            0, _COARSE_STEPS, partial(step, number), start, unroll=rounds_per_step()
+            0, _COARSE_STEPS, partial(step, number), start, unroll=rounds_per_step(_COARSE_STEPS)
         )
         fit = fit_of(sums, few.some)
         if anchor.information is None:
