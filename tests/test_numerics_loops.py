@@ -1,11 +1,16 @@
 """How loops run: steps on a GPU, and all cores of a CPU."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 from hiosdf_jax._src.numerics import loops
+from hiosdf_jax._src.numerics.modes import varying_like
 
 
 @pytest.mark.parametrize(
@@ -40,3 +45,14 @@ def test_a_counter_that_is_shared_works_in_vmap_and_with_gradients():
     x, k = jnp.array([2.0, 3.0]), jnp.array([1, 2])
     np.testing.assert_allclose(jax.vmap(power)(x, k), [8 * 6, 27 * 24])
     np.testing.assert_allclose(jax.vmap(jax.grad(power))(x, k), [12 * 6, 27 * 24])
+
+
+def test_a_counter_that_is_shared_works_in_shard_map():
+    mesh = Mesh(np.array(jax.devices()[:1]), "maps")
+
+    @functools.partial(jax.shard_map, mesh=mesh, in_specs=P("maps"), out_specs=P("maps"))
+    def add(x):
+        start = varying_like(jnp.zeros_like(x), x)
+        return jax.lax.fori_loop(0, 4, lambda k, y: y + x * loops.on_all_cores(k, 10**6), start)
+
+    np.testing.assert_array_equal(jax.jit(add)(jnp.arange(3.0)), [0, 6, 12])
