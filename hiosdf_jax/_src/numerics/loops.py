@@ -10,8 +10,7 @@ import jax.numpy as jnp
 
 _MOST_PER_STEP = 10  # on a GPU, so that it starts fewer kernels
 
-# To share a kernel among a CPU's cores takes some microseconds: as long as one of this many numbers
-# on one core.
+# Sharing a kernel among cores costs some microseconds. A kernel of fewer numbers is faster on one.
 _LEAST_TO_SHARE = 50_000
 
 
