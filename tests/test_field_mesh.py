@@ -104,6 +104,27 @@ def test_a_square_is_one_flat_piece_without_holes(seed):
     assert found.area_faces[middle].sum() == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_square_with_noise_is_one_surface(seed):
+    """Its hits lie in two layers of voxels, or three where they are turned."""
+    turn = np.eye(3) if seed == 0 else rotation(seed)
+    center, noise = np.array([0.03, -0.02, 0.04]), 0.04
+    points = square(seed, turn, center)
+    height = np.random.default_rng(seed).normal(0, noise, len(points))
+    points = points + height[:, None] * turn[:, 2]
+    voxel = np.floor(points / VOXEL).astype(int)
+    _, row, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    points = points[count[row.ravel()] > 0.15 * count.max()]  # a map keeps no others
+    found = extract_mesh(field_of(points, center + turn[:, 2]))
+    local = (found.triangles_center - center) @ turn
+    middle = (np.abs(local[:, :2]) < 0.5).all(axis=1)
+    # In single layers, 1.6 to 1.9.
+    assert found.area_faces[middle].sum() == pytest.approx(1.0, abs=0.07)
+    assert np.percentile(np.abs(local[middle, 2]), 95) < 0.02
+    near = (np.abs(((found.vertices - center) @ turn)[:, :2]) < 0.5).all(axis=1)
+    assert 0.4 * noise < np.median(found.vertex_attributes["spread"][near]) < 1.2 * noise
+
+
 def test_a_sphere():
     center, radius = np.array([0.03, -0.01, 0.02]), 0.7
     rays = np.random.default_rng(0).normal(size=(200_000, 3))

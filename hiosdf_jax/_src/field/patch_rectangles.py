@@ -85,14 +85,16 @@ def find_patches(surface: Surface) -> Patches:
     return Patches(voxel, center, EXTENT_DEVIATIONS * axes[used].astype(float), in_free_space)
 
 
-def with_patches(surface: Surface, patches: Patches) -> Surface:
+def with_patches(surface: Surface, patches: Patches, nearest: np.ndarray) -> Surface:
     """Puts patches into the surface in which they were found, on its device.
+
+    `nearest` has the offsets to the voxels of their nearest patches, as in `Derived`.
 
     Where a voxel with a patch knows one that fills another voxel, it knows its own instead: a patch
     inside a thin wall may lie across, and nearer to the centers of voxels than the wall's sides.
     """
     arrays = surface.mean, surface.axes, surface.derived.nearest
-    mean, axes, nearest = (np.array(array) for array in arrays)
+    mean, axes, nearest = np.array(surface.mean), np.array(surface.axes), np.array(nearest)
     row = tuple(patches.voxel.T)
     mean[row] = patches.center - patches.voxel - 0.5
     axes[row] = patches.deviations

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hiosdf_jax._src.field.patch_neighbors import dot, neighbors, steps
 from hiosdf_jax._src.field.patch_rectangles import Patches
 
 # A patch continues another one's plane if their normals have at least this cosine, and the center
@@ -57,10 +58,10 @@ def _smooth(patches: Patches, shape: tuple[int, int, int]) -> tuple[np.ndarray, 
     for pair in pairs:
         for own, added, offset in pair.directions():
             share = area[added] * pair.nearness
-            side = np.where(_dot(normal[own], normal[added]) < 0, -1, 1)
+            side = np.where(dot(normal[own], normal[added]) < 0, -1, 1)
             between = 0.5 * (normal[own] + side[:, None] * normal[added])
             total[own] += share
-            height[own] += share * _dot(offset, between)
+            height[own] += share * dot(offset, between)
     center = patches.center + (height / total)[:, None] * normal
     return center, _turned(patches.axes, normal)
 
@@ -89,14 +90,15 @@ class _Pairs(NamedTuple):
 def _find_pairs(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int]) -> list[_Pairs]:
     """Finds the patches in neighboring voxels that continue each other."""
     thickness, pairs = patches.thickness, []
-    for one, other in _neighbors(patches.voxel, shape):
+    directions = steps(1)
+    for one, other in neighbors(patches.voxel, shape, directions[len(directions) // 2 :]):
         offset = patches.center[other] - patches.center[one]
-        height = [_dot(offset, normal[row]) for row in (one, other)]
-        cosine = _dot(normal[one], normal[other])
+        height = [dot(offset, normal[row]) for row in (one, other)]
+        cosine = dot(normal[one], normal[other])
         farthest = _FARTHEST_VOXELS + np.where(cosine > 0, thickness[one] + thickness[other], 0)
         kept = (np.max(np.abs(height), axis=0) < farthest) & (np.abs(cosine) > _LEAST_COSINE)
         offset = offset[kept]
-        nearness = np.exp(-0.5 * _dot(offset, offset) / _NEAR_VOXELS**2)
+        nearness = np.exp(-0.5 * dot(offset, offset) / _NEAR_VOXELS**2)
         pairs.append(_Pairs(one[kept], other[kept], offset, nearness))
     return pairs
 
@@ -118,37 +120,15 @@ def _plane_normals(
     mean = first / total[:, None]
     spread = second / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
     found = np.linalg.eigh(spread)[1][:, :, 0]
-    cosine = _dot(found, normal)
+    cosine = dot(found, normal)
     found *= np.where(cosine < 0, -1, 1)[:, None]
     # The principal plane of a column of narrow patches may lie across them.
     return np.where(np.abs(cosine)[:, None] > _LEAST_COSINE, found, normal)
 
 
-def _neighbors(voxel: np.ndarray, shape: tuple[int, int, int]) -> list[tuple[np.ndarray, ...]]:
-    """Returns rows of voxels (M, 3) and of their neighbors, once per pair, for 13 directions."""
-    padded = np.add(shape, 2)
-    row = np.full(padded.prod(), -1, np.int32)
-    flat = np.ravel_multi_index(tuple((voxel + 1).T), padded)
-    row[flat] = np.arange(len(voxel))
-    pairs = []
-    for step in np.ndindex(3, 3, 3):
-        if step > (1, 1, 1):
-            beside = row[
-                flat + np.ravel_multi_index(step, padded) - np.ravel_multi_index((1, 1, 1), padded)
-            ]
-            first = np.flatnonzero(beside >= 0)
-            pairs.append((first, beside[first]))
-    return pairs
-
-
 def _turned(axes: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Turns axes (M, 3, 3) until the first two are perpendicular to a normal (M, 3)."""
     size = np.linalg.norm(axes, axis=-1, keepdims=True)
-    along = axes[:, 0] - _dot(axes[:, 0], normal)[:, None] * normal
+    along = axes[:, 0] - dot(axes[:, 0], normal)[:, None] * normal
     along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
     return size * np.stack([along, np.cross(normal, along), normal], axis=1)
-
-
-def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Computes the scalar products of vectors (M, 3)."""
-    return np.einsum("ij,ij->i", one, other)
