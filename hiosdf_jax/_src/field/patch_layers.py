@@ -20,9 +20,11 @@ from hiosdf_jax._src.state.pytrees import NO_FEATURE
 
 # Patches are joined where the root mean square of the thickness around them is larger than the
 # first number, voxels. Hits that fill a voxel evenly have 0.29. Patches that are sharper than the
-# second one count more: strays beside or inside a sharp wall are no noise.
+# second one count more: strays beside or inside a sharp wall are no noise. Sharp patches are joined
+# if more than the third number of the area around them is.
 _NOISY_VOXELS = 0.15
 _SHARP_VOXELS = 0.1
+_NOISY_SHARE = 0.4
 
 # A patch's weight in a plane is its area times a Gaussian of its distance with this deviation,
 # voxels, times the density of its hits. The logarithm of the density is limited to this.
@@ -59,7 +61,7 @@ _ROUNDS = 2
 _LEAST_PAIRS = 200_000
 
 # Points along each side of a patch that stand for it when voxels look for their nearest one.
-_MARKS = 4
+_MARKS = 3
 
 # No surface is this far from the voxels that know it, voxels.
 _FARTHEST_MARK = 3.0
@@ -91,8 +93,8 @@ def join(patches: Patches, shape: tuple[int, int, int]) -> Joined:
         The patches; those away from noise as they were.
     """
     area = np.prod(np.linalg.norm(patches.axes[:, :2], axis=-1), axis=-1)
-    rows = np.flatnonzero(_thickness_around(patches, area, shape) > _NOISY_VOXELS)
     center, normal = patches.center.copy(), patches.normal
+    rows = np.flatnonzero(_are_noisy(patches, area, normal, shape))
     for turn in range(_ROUNDS):
         plane = _planes(patches, area, center, normal, rows, shape)
         if turn == 0:
@@ -103,13 +105,14 @@ def join(patches: Patches, shape: tuple[int, int, int]) -> Joined:
     moved[rows] = True
     if not len(rows):
         return Joined(patches, moved, patches.thickness)
+    height = dot(center - patches.center, normal)
     voxel = patches.voxel.copy()
     voxel[rows] = np.clip(np.floor(center[rows]).astype(int), 0, np.subtract(shape, 1))
     flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), shape))
     met = np.isin(flat, flat[rows])
     merged = _merge(
         patches._replace(voxel=voxel, center=center).part(met),
-        *(values[met] for values in (area, normal, moved, flat)),
+        *(values[met] for values in (area, normal, height, moved, flat)),
     )
     others = patches.part(~met)
     both = zip(merged.patches, others, strict=True)
@@ -184,21 +187,28 @@ def _dilated(mask: np.ndarray) -> np.ndarray:
     return maximum_filter(mask, 3, mode="constant")
 
 
-def _thickness_around(
-    patches: Patches, area: np.ndarray, shape: tuple[int, int, int]
+def _are_noisy(
+    patches: Patches, area: np.ndarray, normal: np.ndarray, shape: tuple[int, int, int]
 ) -> np.ndarray:
-    """Computes the root mean square of the thickness of patches and those beside them, (M,)."""
-    square, normal = patches.thickness**2, patches.normal
-    weight = area / (square + _SHARP_VOXELS**2)
-    total, summed = weight.copy(), weight * square
-    directions = steps(1)
+    """Returns a mask of the patches in noise, (M,) bool."""
+    pairs, directions = [], steps(1)
     for one, other in neighbors(patches.voxel, shape, directions[len(directions) // 2 :]):
-        nearness = _nearness(patches.center[other] - patches.center[one])
-        nearness *= dot(normal[one], normal[other]) > _LEAST_FACING
-        for own, added in ((one, other), (other, one)):
-            total[own] += nearness * weight[added]
-            summed[own] += nearness * weight[added] * square[added]
-    return np.sqrt(summed / np.maximum(total, 1e-12))
+        kept = dot(normal[one], normal[other]) > _LEAST_FACING
+        one, other = one[kept], other[kept]
+        pairs.append((one, other, _nearness(patches.center[other] - patches.center[one])))
+
+    def mean_around(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        total, summed = weight.copy(), weight * values
+        for one, other, nearness in pairs:
+            for own, added in ((one, other), (other, one)):
+                share = nearness * weight[added]
+                total[own] += share
+                summed[own] += share * values[added]
+        return summed / np.maximum(total, 1e-12)
+
+    square = patches.thickness**2
+    noisy = mean_around(square, area / (square + _SHARP_VOXELS**2)) > _NOISY_VOXELS**2
+    return noisy | (mean_around(noisy, area) > _NOISY_SHARE)
 
 
 class _Planes(NamedTuple):
@@ -239,9 +249,9 @@ def _planes(
         own, added = own[same_side], added[same_side]
         offset = center[added] - center[own]
         # The mean of a voxel's hits lies on the side on which they are denser: a gradient g of the
-        # logarithm of their density moves it by g / 12.
+        # logarithm of their density moves it by g / 12. The integral of g is the growth.
         step = patches.voxel[added] - patches.voxel[own]
-        growth = 12 * 0.5 * dot(shift[own] + shift[added], step)
+        growth = 0.5 * dot(12 * (shift[own] + shift[added]), step)
         density = np.exp(np.clip(growth, -_MOST_GROWTH, _MOST_GROWTH))
         share = area[added] * _nearness(offset) * density
         beside = moment[added] + offset[:, :, None] * offset[:, None, :]
@@ -266,9 +276,26 @@ def _planes(
 
 
 def _merge(
-    patches: Patches, area: np.ndarray, normal: np.ndarray, moved: np.ndarray, flat: np.ndarray
+    patches: Patches,
+    area: np.ndarray,
+    normal: np.ndarray,
+    height: np.ndarray,
+    moved: np.ndarray,
+    flat: np.ndarray,
 ) -> Joined:
-    """Makes one patch of those in the same voxel; `flat` numbers their voxels, (M,)."""
+    """Makes one patch of those in the same voxel.
+
+    Args:
+        patches: Where they have moved to.
+        area: Their areas, (M,) voxels^2.
+        normal: Of the planes that they lie on now, (M, 3).
+        height: How far they have moved along it, (M,) voxels.
+        moved: Which ones have moved, (M,) bool.
+        flat: Numbers of their voxels, (M,).
+
+    Returns:
+        A patch for each voxel.
+    """
     flat, first, group = np.unique(flat, return_index=True, return_inverse=True)
     center = patches.center
     # Patches that have not moved lead, then larger ones; those that disagree with the leader go.
@@ -302,8 +329,10 @@ def _merge(
     )
     axes = np.where(is_joined[:, None, None], axes, patches.axes[leader])
     middle = np.where(is_joined[:, None], middle, patches.center[leader])
-    spread = np.where(is_joined, across, patches.thickness[leader])
-    in_free_space = np.bincount(group, patches.in_free_space) > 0
+    spread = np.sqrt(across**2 + mean(height**2))
+    spread = np.where(is_joined, spread, patches.thickness[leader])
+    # Those of a noisy surface are not drawn one by one beside it.
+    in_free_space = (np.bincount(group, patches.in_free_space) > 0) & ~is_joined
     return Joined(Patches(patches.voxel[first], middle, axes, in_free_space), is_joined, spread)
 
 
