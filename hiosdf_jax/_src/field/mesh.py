@@ -67,7 +67,7 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     """Extracts the observed surfaces of a map.
 
     The mesh is the zero level of a blend of the grid's surface patches, after each took the plane
-    through it and those that continue it. Patches that noise put into layers before each other
+    through it and those that continue it. Stacked layers of patches, which noise leaves,
     become one surface. The mesh has surfaces where rays ended, and closes gaps between them that
     are narrower than 0.6 voxels. A sheet that was seen from both sides, such as a door, is a single
     surface, or two if it is thicker than 0.2 voxels. A patch that the level misses, such as a part
@@ -142,6 +142,7 @@ def _points_near(patches: Patches, shape: tuple[int, ...]) -> np.ndarray:
     """Marks the corners of the cells of the lattice in which patches lie, bool."""
     most = np.multiply(shape, CELLS_PER_VOXEL)
     near = np.zeros(most + 1 + 2 * PADDING, bool)
+    # One flat index is faster than three. A bool is one byte, so its strides count elements.
     flat, stride = near.reshape(-1), np.array(near.strides)
     center, axes = CELLS_PER_VOXEL * patches.center, CELLS_PER_VOXEL * patches.axes
     beside, along = CELLS_PER_VOXEL * _BESIDE_VOXELS * patches.normal, np.linspace(-1, 1, _MARKS)

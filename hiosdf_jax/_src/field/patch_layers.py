@@ -1,8 +1,7 @@
-"""Joins patches that lie in layers: noise wider than a voxel leaves several before each other.
+"""Joins stacked patches: noise spreads the hits of one surface over several layers of voxels.
 
-Each voxel fits a patch to its own hits. Where the noise of the sensor is a large part of a voxel,
-the hits of one surface fall into several layers of voxels, and their patches are thick and tilted.
-Here all of them move onto the plane through the patches around them.
+Each voxel fits a patch to its own hits, so the patches of a noisy surface are stacked, thick and
+tilted. This module moves them onto the planes through the patches around them.
 """
 
 from __future__ import annotations
@@ -13,17 +12,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.field.patch_neighbors import dot, neighbors, steps
+from hiosdf_jax._src.field.patch_neighbors import (
+    HALF_OF_26,
+    dot,
+    gaussian,
+    neighbors,
+    offsets_within,
+)
 from hiosdf_jax._src.field.patch_rectangles import FILLING_VOXELS, Patches
 from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
-from hiosdf_jax._src.state.pytrees import NO_FEATURE
 
-# Patches are joined where the root mean square of the thickness around them is larger than the
-# first number, voxels. Hits that fill a voxel evenly have 0.29. Patches that are sharper than the
-# second one count more: strays beside or inside a sharp wall are no noise. Sharp patches are joined
-# if more than the third number of the area around them is.
+# Patches are noisy where the root mean square of the thickness around them is larger than this,
+# voxels. Hits that fill a voxel evenly have 0.29.
 _NOISY_VOXELS = 0.15
+
+# Patches that are sharper than this, voxels, weigh more: strays beside a sharp wall are no noise.
 _SHARP_VOXELS = 0.1
+
+# Other patches are noisy, too, if more than this share of the area around them is.
 _NOISY_SHARE = 0.4
 
 # A patch's weight in a plane is its area times a Gaussian of its distance with this deviation,
@@ -31,8 +37,8 @@ _NOISY_SHARE = 0.4
 _NEAR_VOXELS = 0.8
 _MOST_GROWTH = 3.0
 
-# The plane goes through patches up to this many voxels away: a layer on either side, twice.
-_REACH = 2
+# The plane goes through patches in the voxels at these offsets; the weight of others is small.
+_OFFSETS = [offset for offset in offsets_within(2) if np.dot(offset, offset) < 6]
 
 # At least this many patches make a plane, and the variance across it is at most this share of the
 # smaller one along it. Where surfaces meet there is no such plane.
@@ -54,77 +60,58 @@ _FARTHEST_VOXELS = 0.35
 # Joined patches do not fill their voxel, however wide the noise is.
 _MOST_THICKNESS = 0.75 * FILLING_VOXELS
 
-# Each joined patch moves twice: the plane of neighbors that have moved is less tilted.
-_ROUNDS = 2
-
-# Pairs of patches that are handled at a time: one step has few, and all take much memory.
+# Offsets to neighbors are handled together until they have this many pairs of patches. One by one
+# they are slow, and all at once they take much memory.
 _LEAST_PAIRS = 200_000
+
+# Patches move this often by the mean height of those around them.
+_ROUNDS = 2
 
 # Points along each side of a patch that stand for it when voxels look for their nearest one.
 _MARKS = 3
 
-# No surface is this far from the voxels that know it, voxels.
-_FARTHEST_MARK = 3.0
-
 
 class Joined(NamedTuple):
-    """Patches without layers.
+    """Patches after stacked ones were joined.
 
     Attributes:
         patches: At most one in each voxel, M of them.
-        moved: Those that were joined, (M,) bool.
+        is_joined: Those made of one or more that moved, (M,) bool.
         spread: Standard deviation of the hits along the normals, (M,) voxels. It may be larger than
             the thickness of the patches.
     """
 
     patches: Patches
-    moved: np.ndarray
+    is_joined: np.ndarray
     spread: np.ndarray
 
 
 def join(patches: Patches, shape: tuple[int, int, int]) -> Joined:
-    """Moves patches that lie in layers onto one surface.
+    """Moves stacked patches onto one surface.
 
     Args:
         patches: At most one in each voxel.
-        shape: Of the grid.
+        shape: Voxels of the grid along x, y and z.
 
     Returns:
-        The patches; those away from noise as they were.
+        The patches, in another order. Those away from noise are unchanged.
     """
-    area = np.prod(np.linalg.norm(patches.axes[:, :2], axis=-1), axis=-1)
-    center, normal = patches.center.copy(), patches.normal
+    area, normal, center = patches.area, patches.normal, patches.center.copy()
     rows = np.flatnonzero(_are_noisy(patches, area, normal, shape))
-    for turn in range(_ROUNDS):
-        plane = _planes(patches, area, center, normal, rows, shape)
-        if turn == 0:
-            rows, plane = rows[plane.is_flat], plane.part(plane.is_flat)
-        center[rows] += plane.height[:, None] * plane.normal
-        normal[rows] = plane.normal
-    moved = np.zeros(len(area), bool)
-    moved[rows] = True
-    if not len(rows):
-        return Joined(patches, moved, patches.thickness)
-    height = dot(center - patches.center, normal)
-    voxel = patches.voxel.copy()
-    voxel[rows] = np.clip(np.floor(center[rows]).astype(int), 0, np.subtract(shape, 1))
-    flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), shape))
-    met = np.isin(flat, flat[rows])
-    merged = _merge(
-        patches._replace(voxel=voxel, center=center).part(met),
-        *(values[met] for values in (area, normal, height, moved, flat)),
-    )
-    others = patches.part(~met)
-    both = zip(merged.patches, others, strict=True)
-    return Joined(
-        Patches(*(np.concatenate(parts) for parts in both)),
-        np.concatenate([merged.moved, np.zeros(len(others.voxel), bool)]),
-        np.concatenate([merged.spread, others.thickness]),
-    )
+    found, is_flat = _plane_normals(patches, area, normal, rows, shape)
+    rows = rows[is_flat]
+    normal[rows] = found[is_flat]
+    for _ in range(_ROUNDS):
+        height = _heights(patches, area, center, normal, rows, shape)
+        center[rows] += height[:, None] * normal[rows]
+    return _merge(patches, area, center, normal, rows, shape)
 
 
 def nearest_of(nearest: np.ndarray, patches: Patches, joined: Joined) -> np.ndarray:
     """Finds the nearest patch anew for voxels around those that moved.
+
+    Voxels more than two voxels away keep their offsets, even to patches that are gone: they are not
+    among the eight voxels around any point of the surface.
 
     Args:
         nearest: Offsets to the nearest of `patches`, as in `Derived`, (X, Y, Z, 3) int8.
@@ -137,25 +124,20 @@ def nearest_of(nearest: np.ndarray, patches: Patches, joined: Joined) -> np.ndar
     from scipy.spatial import KDTree
 
     nearest, shape = np.array(nearest), nearest.shape[:3]
-    if not joined.moved.any():
+    if not joined.is_joined.any():
         return nearest
     after = joined.patches
     changed = np.zeros(shape, bool)
     changed[tuple(patches.voxel.T)] = True
-    changed[tuple(after.voxel[~joined.moved].T)] = False
-    changed[tuple(after.voxel[joined.moved].T)] = True
-    region = _dilated(changed)
-    near = after.part(_dilated(region)[tuple(after.voxel.T)])
+    changed[tuple(after.voxel[~joined.is_joined].T)] = False
+    changed[tuple(after.voxel[joined.is_joined].T)] = True
+    region = _largest_around(changed, 2)
+    near = after.part(_largest_around(region, 2)[tuple(after.voxel.T)])
     line = np.linspace(-0.8, 0.8, _MARKS)
     marks = [near.center + a * near.axes[:, 0] + b * near.axes[:, 1] for a in line for b in line]
     voxel = np.argwhere(region)
-    distance, mark = KDTree(np.concatenate(marks)).query(
-        voxel + 0.5, distance_upper_bound=_FARTHEST_MARK, workers=-1
-    )
-    known = np.isfinite(distance)
-    nearest[region] = NO_FEATURE
-    voxel = voxel[known]
-    nearest[tuple(voxel.T)] = near.voxel[mark[known] % len(near.voxel)] - voxel
+    _, mark = KDTree(np.concatenate(marks)).query(voxel + 0.5, workers=-1)
+    nearest[region] = near.voxel[mark % len(near.voxel)] - voxel
     return nearest
 
 
@@ -170,32 +152,33 @@ def spread_around(joined: Joined, shape: tuple[int, int, int], position: np.ndar
     Returns:
         (V,) voxels; 0 where no patch was joined.
     """
-    from scipy.ndimage import maximum_filter
-
-    if not joined.moved.any():
+    if not joined.is_joined.any():
         return np.zeros(len(position), np.float32)
     spread = np.zeros(shape, np.float32)
-    spread[tuple(joined.patches.voxel[joined.moved].T)] = joined.spread[joined.moved]
+    rows = joined.is_joined
+    spread[tuple(joined.patches.voxel[rows].T)] = joined.spread[rows]
     voxel = np.clip(np.floor(position).astype(int), 0, np.subtract(shape, 1))
-    return maximum_filter(spread, 3, mode="constant")[tuple(voxel.T)]
+    return _largest_around(spread, 1)[tuple(voxel.T)]
 
 
-def _dilated(mask: np.ndarray) -> np.ndarray:
-    """Adds the 26 voxels around each."""
+def _largest_around(values: np.ndarray, reach: int) -> np.ndarray:
+    """Takes the largest value of the voxels up to `reach` away along each axis."""
     from scipy.ndimage import maximum_filter
 
-    return maximum_filter(mask, 3, mode="constant")
+    return maximum_filter(values, 2 * reach + 1, mode="constant")
 
 
 def _are_noisy(
     patches: Patches, area: np.ndarray, normal: np.ndarray, shape: tuple[int, int, int]
 ) -> np.ndarray:
     """Returns a mask of the patches in noise, (M,) bool."""
-    pairs, directions = [], steps(1)
-    for one, other in neighbors(patches.voxel, shape, directions[len(directions) // 2 :]):
+    pairs = []
+    for one, other in neighbors(patches.voxel, shape, HALF_OF_26):
         kept = dot(normal[one], normal[other]) > _LEAST_FACING
         one, other = one[kept], other[kept]
-        pairs.append((one, other, _nearness(patches.center[other] - patches.center[one])))
+        pairs.append(
+            (one, other, gaussian(patches.center[other] - patches.center[one], _NEAR_VOXELS))
+        )
 
     def mean_around(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         total, summed = weight.copy(), weight * values
@@ -211,59 +194,30 @@ def _are_noisy(
     return noisy | (mean_around(noisy, area) > _NOISY_SHARE)
 
 
-class _Planes(NamedTuple):
-    """Planes through patches and those around them, of K patches.
-
-    Attributes:
-        normal: Unit vectors toward the sensor's side, (K, 3).
-        height: Above the patches' centers, (K,) voxels.
-        is_flat: Whether the patches around lie about a plane, (K,) bool.
-    """
-
-    normal: np.ndarray
-    height: np.ndarray
-    is_flat: np.ndarray
-
-    def part(self, kept: np.ndarray) -> _Planes:
-        """Returns the planes of a mask, (K,) bool."""
-        return _Planes(*(values[kept] for values in self))
-
-
-def _planes(
+def _plane_normals(
     patches: Patches,
     area: np.ndarray,
-    center: np.ndarray,
     normal: np.ndarray,
     rows: np.ndarray,
     shape: tuple[int, int, int],
-) -> _Planes:
-    """Fits planes to the patches around the given rows, with their new centers and normals."""
-    place = np.full(len(area), -1)
-    place[rows] = np.arange(len(rows))
-    deviations, shift = patches.deviations, patches.center - patches.voxel - 0.5
-    moment = np.einsum("mki,mkj->mij", deviations, deviations)
-    total, count, first = area[rows], np.ones(len(rows)), np.zeros((len(rows), 3))
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fits planes to the patches around K given ones.
+
+    Returns:
+        Their normals, unit vectors toward the sensor's side, (K, 3), and a mask of those around
+        which the patches lie about a plane, (K,) bool.
+    """
+    size, moment = len(rows), patches.moment
+    total, count, first = area[rows], np.ones(size), np.zeros((size, 3))
     second, facing = total[:, None, None] * moment[rows], total[:, None] * normal[rows]
-    for own, added in _batches(neighbors(patches.voxel, shape, steps(_REACH), rows)):
-        same_side = dot(normal[own], normal[added]) > _LEAST_FACING
-        own, added = own[same_side], added[same_side]
-        offset = center[added] - center[own]
-        # The mean of a voxel's hits lies on the side on which they are denser: a gradient g of the
-        # logarithm of their density moves it by g / 12. The integral of g is the growth.
-        step = patches.voxel[added] - patches.voxel[own]
-        growth = 0.5 * dot(12 * (shift[own] + shift[added]), step)
-        density = np.exp(np.clip(growth, -_MOST_GROWTH, _MOST_GROWTH))
-        share = area[added] * _nearness(offset) * density
+    for own, added, to, share in _weighted(patches, area, patches.center, normal, rows, shape):
+        offset = patches.center[added] - patches.center[own]
         beside = moment[added] + offset[:, :, None] * offset[:, None, :]
-
-        def summed(values: np.ndarray, to: np.ndarray = place[own]) -> np.ndarray:
-            return _sums(values, to, len(rows))
-
-        total = total + summed(share)
-        count += summed(np.ones_like(share))
-        first += summed(share[:, None] * offset)
-        second += summed(share[:, None, None] * beside)
-        facing += summed(share[:, None] * normal[added])
+        total = total + _sums(share, to, size)
+        count += _sums(np.ones_like(share), to, size)
+        first += _sums(share[:, None] * offset, to, size)
+        second += _sums(share[:, None, None] * beside, to, size)
+        facing += _sums(share[:, None] * normal[added], to, size)
     total = np.maximum(total, 1e-12)
     mean = first / total[:, None]
     spread = second / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
@@ -272,68 +226,155 @@ def _planes(
     found *= np.where(dot(facing, found) < 0, -1, 1)[:, None]
     is_flat = (variance[:, 0] < _MOST_ACROSS * variance[:, 1]) & (count >= _LEAST_PATCHES)
     is_flat &= dot(facing, found) > _LEAST_MEAN_FACING * total
-    return _Planes(found, dot(mean, found), is_flat)
+    return found, is_flat
+
+
+def _heights(
+    patches: Patches,
+    area: np.ndarray,
+    center: np.ndarray,
+    normal: np.ndarray,
+    rows: np.ndarray,
+    shape: tuple[int, int, int],
+) -> np.ndarray:
+    """Computes the mean height of the patches around K given ones, (K,) voxels.
+
+    A height is the mean of that above the one patch's plane and that below the other one's: on a
+    sphere it is 0.
+    """
+    total, summed = area[rows], np.zeros(len(rows))
+    for own, added, to, share in _weighted(patches, area, center, normal, rows, shape):
+        between = 0.5 * (normal[own] + normal[added])
+        height = dot(center[added] - center[own], between)
+        total = total + _sums(share, to, len(rows))
+        summed += _sums(share * height, to, len(rows))
+    return summed / np.maximum(total, 1e-12)
+
+
+def _weighted(
+    patches: Patches,
+    area: np.ndarray,
+    center: np.ndarray,
+    normal: np.ndarray,
+    rows: np.ndarray,
+    shape: tuple[int, int, int],
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yields given rows, those of patches around them on the same side, and their weights.
+
+    Yields:
+        For P pairs, in batches: the rows of both, the places of the first ones in `rows`, and the
+        weights of the second ones, (P,) each.
+    """
+    place = np.full(len(area), -1)
+    place[rows] = np.arange(len(rows))
+    shift = patches.center - patches.voxel - 0.5
+    for own, added in _batches(neighbors(patches.voxel, shape, _OFFSETS, rows)):
+        same_side = dot(normal[own], normal[added]) > _LEAST_FACING
+        own, added = own[same_side], added[same_side]
+        # The mean of a voxel's hits lies on the side on which they are denser: a gradient g of the
+        # logarithm of their density moves it by g / 12. The integral of g is the growth.
+        step = patches.voxel[added] - patches.voxel[own]
+        growth = 0.5 * dot(12 * (shift[own] + shift[added]), step)
+        density = np.exp(np.clip(growth, -_MOST_GROWTH, _MOST_GROWTH))
+        share = area[added] * gaussian(center[added] - center[own], _NEAR_VOXELS) * density
+        yield own, added, place[own], share
 
 
 def _merge(
     patches: Patches,
     area: np.ndarray,
+    center: np.ndarray,
     normal: np.ndarray,
-    height: np.ndarray,
-    moved: np.ndarray,
-    flat: np.ndarray,
+    rows: np.ndarray,
+    shape: tuple[int, int, int],
 ) -> Joined:
-    """Makes one patch of those in the same voxel.
+    """Makes one patch of those that have come to lie in the same voxel.
+
+    Args:
+        patches: Before the given ones moved.
+        area: Their areas, (M,) voxels^2.
+        center: Where they have moved to, (M, 3) voxels.
+        normal: Of the planes that they lie on now, (M, 3).
+        rows: Of those that have moved, (K,).
+        shape: Voxels of the grid along x, y and z.
+
+    Returns:
+        At most one patch for each voxel.
+    """
+    voxel = patches.voxel.copy()
+    voxel[rows] = np.clip(np.floor(center[rows]).astype(int), 0, np.subtract(shape, 1))
+    moved = np.zeros(len(area), bool)
+    moved[rows] = True
+    while True:
+        flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), shape))
+        met = np.flatnonzero(np.isin(flat, flat[moved]))
+        group = np.unique(flat[met], return_inverse=True)[1]
+        # Patches that have not moved lead, then larger ones.
+        order = np.lexsort((-area[met], moved[met], group))
+        leader = met[order[np.searchsorted(group[order], np.arange(np.max(group, initial=-1) + 1))]]
+        led = leader[group]
+        agrees = dot(normal[met], normal[led]) > _LEAST_COSINE
+        agrees &= np.abs(dot(center[met] - center[led], normal[led])) < _FARTHEST_VOXELS
+        back = met[~agrees & (met != led)]
+        if not len(back):
+            break
+        # Those that disagree with the leader return: they may be another side of a thin wall.
+        moved[back] = False
+        voxel[back], center[back] = patches.voxel[back], patches.center[back]
+        normal[back] = patches.normal[back]
+    if not len(met):
+        return Joined(patches, moved, patches.thickness)
+    kept = np.setdiff1d(np.arange(len(area)), met)
+    height = dot(center - patches.center, normal)[met]
+    moved_to = patches._replace(voxel=voxel, center=center).part(met)
+    merged, spread = _means(moved_to, area[met], normal[met], height, group)
+    return Joined(
+        Patches(*map(np.concatenate, zip(merged, patches.part(kept), strict=True))),
+        np.repeat([True, False], [len(spread), len(kept)]),
+        np.concatenate([spread, patches.thickness[kept]]),
+    )
+
+
+def _means(
+    patches: Patches, area: np.ndarray, normal: np.ndarray, height: np.ndarray, group: np.ndarray
+) -> tuple[Patches, np.ndarray]:
+    """Averages patches in the same voxel, by area.
 
     Args:
         patches: Where they have moved to.
         area: Their areas, (M,) voxels^2.
-        normal: Of the planes that they lie on now, (M, 3).
+        normal: Of the planes that they lie on, (M, 3).
         height: How far they have moved along it, (M,) voxels.
-        moved: Which ones have moved, (M,) bool.
-        flat: Numbers of their voxels, (M,).
+        group: Numbers of their voxels, 0 to N - 1, (M,).
 
     Returns:
-        A patch for each voxel.
+        N patches, and the standard deviations of their hits along the normals before they moved,
+        (N,) voxels.
     """
-    flat, first, group = np.unique(flat, return_index=True, return_inverse=True)
-    center = patches.center
-    # Patches that have not moved lead, then larger ones; those that disagree with the leader go.
-    order = np.lexsort((-area, moved, group))
-    leader = order[np.searchsorted(group[order], np.arange(len(flat)))]
-    led = leader[group]
-    agrees = dot(normal, normal[led]) > _LEAST_COSINE
-    agrees &= np.abs(dot(center - center[led], normal[led])) < _FARTHEST_VOXELS
-    weight = np.where(agrees, area, 0)
-    weight /= np.maximum(np.bincount(group, weight), 1e-12)[group]
+    _, first = np.unique(group, return_index=True)
+    area = np.maximum(area, 1e-12)
+    weight = area / np.bincount(group, area)[group]
 
     def mean(values: np.ndarray) -> np.ndarray:
         factor = weight.reshape(-1, *[1] * (values.ndim - 1))
-        return _sums(factor * values, group, len(flat))
+        return _sums(factor * values, group, len(first))
 
-    is_joined = np.bincount(group, moved & agrees) > 0
-    middle, up = mean(center), mean(normal)
+    middle, up = mean(patches.center), mean(normal)
     up /= np.maximum(np.linalg.norm(up, axis=-1, keepdims=True), 1e-12)
-    deviations, offset = patches.deviations, center - middle[group]
-    moment = np.einsum("mki,mkj->mij", deviations, deviations)
-    moment = mean(moment + offset[:, :, None] * offset[:, None, :])
+    offset = patches.center - middle[group]
+    moment = mean(patches.moment + offset[:, :, None] * offset[:, None, :])
     across = np.sqrt(np.maximum(np.einsum("mi,mij,mj->m", up, moment, up), 0))
     flatten = np.eye(3) - up[:, :, None] * up[:, None, :]
     variance, direction = np.linalg.eigh(flatten @ moment @ flatten)
     long, middling = np.sqrt(np.maximum(variance[:, [2, 1]], 0)).T
-    along = direction[:, :, 2]
-    thick = np.minimum(across, _MOST_THICKNESS)
-    axes = EXTENT_DEVIATIONS * np.stack(
-        [long[:, None] * along, middling[:, None] * np.cross(up, along), thick[:, None] * up],
-        axis=1,
-    )
-    axes = np.where(is_joined[:, None, None], axes, patches.axes[leader])
-    middle = np.where(is_joined[:, None], middle, patches.center[leader])
-    spread = np.sqrt(across**2 + mean(height**2))
-    spread = np.where(is_joined, spread, patches.thickness[leader])
+    along, thick = direction[:, :, 2], np.minimum(across, _MOST_THICKNESS)
+    axes = [long[:, None] * along, middling[:, None] * np.cross(up, along), thick[:, None] * up]
     # Those of a noisy surface are not drawn one by one beside it.
-    in_free_space = (np.bincount(group, patches.in_free_space) > 0) & ~is_joined
-    return Joined(Patches(patches.voxel[first], middle, axes, in_free_space), is_joined, spread)
+    in_free_space = np.zeros(len(first), bool)
+    joined = Patches(
+        patches.voxel[first], middle, EXTENT_DEVIATIONS * np.stack(axes, axis=1), in_free_space
+    )
+    return joined, np.sqrt(across**2 + mean(height**2))
 
 
 def _batches(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Iterator[list[np.ndarray]]:
@@ -354,8 +395,3 @@ def _sums(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(group, column, count) for column in columns]
     return np.stack(sums, axis=-1).reshape(count, *values.shape[1:])
-
-
-def _nearness(offset: np.ndarray) -> np.ndarray:
-    """Computes a Gaussian of distances, from offsets (P, 3) voxels."""
-    return np.exp(-0.5 * dot(offset, offset) / _NEAR_VOXELS**2)

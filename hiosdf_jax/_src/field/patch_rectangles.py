@@ -45,6 +45,17 @@ class Patches(NamedTuple):
         return self.axes / EXTENT_DEVIATIONS
 
     @property
+    def area(self) -> np.ndarray:
+        """Products of the half edges, a quarter of the areas, (M,)."""
+        return np.prod(np.linalg.norm(self.axes[:, :2], axis=-1), axis=-1)
+
+    @property
+    def moment(self) -> np.ndarray:
+        """Covariances of the hits, (M, 3, 3)."""
+        deviations = self.deviations
+        return np.einsum("mki,mkj->mij", deviations, deviations)
+
+    @property
     def thickness(self) -> np.ndarray:
         """Standard deviation of the hits along the normal, (M,)."""
         return np.linalg.norm(self.axes[:, 2], axis=-1) / EXTENT_DEVIATIONS
@@ -88,22 +99,27 @@ def find_patches(surface: Surface) -> Patches:
 def with_patches(surface: Surface, patches: Patches, nearest: np.ndarray) -> Surface:
     """Puts patches into the surface in which they were found, on its device.
 
-    `nearest` has the offsets to the voxels of their nearest patches, as in `Derived`.
+    Args:
+        surface: The surface.
+        patches: At most one in each voxel.
+        nearest: Offsets to the voxels of the nearest patches, as in `Derived`, (X, Y, Z, 3) int8.
 
-    Where a voxel with a patch knows one that fills another voxel, it knows its own instead: a patch
-    inside a thin wall may lie across, and nearer to the centers of voxels than the wall's sides.
+    Returns:
+        The surface with these patches.
     """
-    arrays = surface.mean, surface.axes, surface.derived.nearest
     mean, axes, nearest = np.array(surface.mean), np.array(surface.axes), np.array(nearest)
     row = tuple(patches.voxel.T)
     mean[row] = patches.center - patches.voxel - 0.5
     axes[row] = patches.deviations
+    # A patch inside a thin wall may lie across, and nearer to the centers of voxels than the wall's
+    # sides: a voxel with a patch of its own then knows that one.
     fills = np.zeros(nearest.shape[:3], bool)
     fills[row] = patches.thickness >= FILLING_VOXELS
     own = patches.voxel[~fills[row]]
     own = own[nearest[tuple(own.T)][:, 0] != NO_FEATURE]
     own = own[fills[tuple((own + nearest[tuple(own.T)]).T)]]
     nearest[tuple(own.T)] = 0
+    arrays = surface.mean, surface.axes, surface.derived.nearest
     places = [getattr(array, "sharding", None) for array in arrays]
     mean, axes, nearest = jax.device_put([mean, axes, nearest], places)
     derived = surface.derived.replace(nearest=nearest)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hiosdf_jax._src.field.patch_neighbors import dot, neighbors, steps
+from hiosdf_jax._src.field.patch_neighbors import HALF_OF_26, dot, gaussian, neighbors
 from hiosdf_jax._src.field.patch_rectangles import Patches
 
 # A patch continues another one's plane if their normals have at least this cosine, and the center
@@ -49,7 +49,7 @@ def smooth(patches: Patches, shape: tuple[int, int, int]) -> Patches:
 def _smooth(patches: Patches, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the centers and axes of smoothed patches."""
     normal = patches.normal
-    area = np.prod(np.linalg.norm(patches.axes[:, :2], axis=-1), axis=-1)
+    area = patches.area
     pairs = _find_pairs(patches, normal, shape)
     normal = _plane_normals(patches, normal, area, pairs)
     # The mean height of a neighbor above the patch's plane, and of the patch above the neighbor's.
@@ -90,16 +90,14 @@ class _Pairs(NamedTuple):
 def _find_pairs(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int]) -> list[_Pairs]:
     """Finds the patches in neighboring voxels that continue each other."""
     thickness, pairs = patches.thickness, []
-    directions = steps(1)
-    for one, other in neighbors(patches.voxel, shape, directions[len(directions) // 2 :]):
+    for one, other in neighbors(patches.voxel, shape, HALF_OF_26):
         offset = patches.center[other] - patches.center[one]
         height = [dot(offset, normal[row]) for row in (one, other)]
         cosine = dot(normal[one], normal[other])
         farthest = _FARTHEST_VOXELS + np.where(cosine > 0, thickness[one] + thickness[other], 0)
         kept = (np.max(np.abs(height), axis=0) < farthest) & (np.abs(cosine) > _LEAST_COSINE)
         offset = offset[kept]
-        nearness = np.exp(-0.5 * dot(offset, offset) / _NEAR_VOXELS**2)
-        pairs.append(_Pairs(one[kept], other[kept], offset, nearness))
+        pairs.append(_Pairs(one[kept], other[kept], offset, gaussian(offset, _NEAR_VOXELS)))
     return pairs
 
 
@@ -107,8 +105,7 @@ def _plane_normals(
     patches: Patches, normal: np.ndarray, area: np.ndarray, pairs: list[_Pairs]
 ) -> np.ndarray:
     """Computes the normals of planes through patches and those that continue them, (M, 3)."""
-    deviations = patches.deviations
-    moment = np.einsum("mki,mkj->mij", deviations, deviations)
+    moment = patches.moment
     total, first, second = area.copy(), np.zeros_like(normal), area[:, None, None] * moment
     for pair in pairs:
         beside = pair.offset[:, :, None] * pair.offset[:, None, :]
