@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -25,6 +25,7 @@ def plain(pose):
     return np.inf if np.isnan(margins).any() else max(margins)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1e-4, 2e-3, 6e-3, 0.1, 3]), st.booleans())
 def test_the_host_accepts_what_jit_accepts(seed, noise, mirrored):
     rng = np.random.default_rng(seed)
