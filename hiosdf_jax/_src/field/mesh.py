@@ -15,6 +15,7 @@ from hiosdf_jax._src.field.contouring import CELLS_PER_VOXEL, PADDING
 from hiosdf_jax._src.field.implicit_surface import Level
 from hiosdf_jax._src.field.lattice import check_resolution
 from hiosdf_jax._src.field.patch_layers import join, nearest_of, spread_around
+from hiosdf_jax._src.field.patch_neighbors import dot
 from hiosdf_jax._src.field.patch_rectangles import (
     Patches,
     Triangles,
@@ -67,12 +68,12 @@ def extract_mesh(field: MapState | Field, resolution: float = 0.05) -> trimesh.T
     """Extracts the observed surfaces of a map.
 
     The mesh is the zero level of a blend of the grid's surface patches, after each took the plane
-    through it and those that continue it. Stacked layers of patches, which noise leaves,
-    become one surface. The mesh has surfaces where rays ended, and closes gaps between them that
-    are narrower than 0.6 voxels. A sheet that was seen from both sides, such as a door, is a single
-    surface, or two if it is thicker than 0.2 voxels. A patch that the level misses, such as a part
-    of a thin leg, is a rectangle in its voxel, 1 % of a voxel wide if its returns lie on a line, as
-    two alone do. Time and memory follow the surface, but for 60 bytes per voxel.
+    through it and those that continue it. Stacked layers of patches, which noise leaves, become one
+    surface. The mesh has surfaces where rays ended, and closes gaps between them that are narrower
+    than 0.6 voxels. A sheet that was seen from both sides, such as a door, is a single surface, or
+    two if it is thicker than 0.2 voxels. A patch that the level misses, such as a part of a thin
+    leg, is a rectangle in its voxel. If its returns lie on a line, as two alone do, it is 1 % of a
+    voxel wide. Time and memory follow the surface, but for 60 bytes per voxel.
 
     Args:
         field: A map or a snapshot of one. The network has no part in the mesh.
@@ -167,7 +168,7 @@ def _are_missed(patches: Patches, contour: Triangles) -> np.ndarray:
     for a, b in _CHECKED:
         point = patches.center + a * patches.axes[:, 0] + b * patches.axes[:, 1]
         distance, row = tree.query(point, workers=-1)
-        height = np.einsum("ij,ij->i", point - contour.vertex[row], contour.normal[row])
+        height = dot(point - contour.vertex[row], contour.normal[row])
         far += distance > _FAR_VOXELS
         off += np.abs(height) > _OFF_VOXELS
     # One corner may be a gap's or the border's.

@@ -96,15 +96,15 @@ def join(patches: Patches, shape: tuple[int, int, int]) -> Joined:
     Returns:
         The patches, in another order. Those away from noise are unchanged.
     """
-    area, normal, center = patches.area, patches.normal, patches.center.copy()
-    rows = np.flatnonzero(_are_noisy(patches, area, normal, shape))
-    found, is_flat = _plane_normals(patches, area, normal, rows, shape)
+    normal, center = patches.normal, patches.center.copy()
+    rows = np.flatnonzero(_are_noisy(patches, normal, shape))
+    found, is_flat = _plane_normals(patches, normal, rows, shape)
     rows = rows[is_flat]
     normal[rows] = found[is_flat]
     for _ in range(_ROUNDS):
-        height = _heights(patches, area, center, normal, rows, shape)
+        height = _heights(patches, center, normal, rows, shape)
         center[rows] += height[:, None] * normal[rows]
-    return _merge(patches, area, center, normal, rows, shape)
+    return _merge(patches, center, normal, rows, shape)
 
 
 def nearest_of(nearest: np.ndarray, patches: Patches, joined: Joined) -> np.ndarray:
@@ -146,7 +146,7 @@ def spread_around(joined: Joined, shape: tuple[int, int, int], position: np.ndar
 
     Args:
         joined: The patches.
-        shape: Of the grid.
+        shape: Voxels of the grid along x, y and z.
         position: (V, 3) voxels from the corner of the grid.
 
     Returns:
@@ -168,9 +168,7 @@ def _largest_around(values: np.ndarray, reach: int) -> np.ndarray:
     return maximum_filter(values, 2 * reach + 1, mode="constant")
 
 
-def _are_noisy(
-    patches: Patches, area: np.ndarray, normal: np.ndarray, shape: tuple[int, int, int]
-) -> np.ndarray:
+def _are_noisy(patches: Patches, normal: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Returns a mask of the patches in noise, (M,) bool."""
     pairs = []
     for one, other in neighbors(patches.voxel, shape, HALF_OF_26):
@@ -189,14 +187,13 @@ def _are_noisy(
                 summed[own] += share * values[added]
         return summed / np.maximum(total, 1e-12)
 
-    square = patches.thickness**2
+    area, square = patches.area, patches.thickness**2
     noisy = mean_around(square, area / (square + _SHARP_VOXELS**2)) > _NOISY_VOXELS**2
     return noisy | (mean_around(noisy, area) > _NOISY_SHARE)
 
 
 def _plane_normals(
     patches: Patches,
-    area: np.ndarray,
     normal: np.ndarray,
     rows: np.ndarray,
     shape: tuple[int, int, int],
@@ -208,9 +205,9 @@ def _plane_normals(
         which the patches lie about a plane, (K,) bool.
     """
     size, moment = len(rows), patches.moment
-    total, count, first = area[rows], np.ones(size), np.zeros((size, 3))
+    total, count, first = patches.area[rows], np.ones(size), np.zeros((size, 3))
     second, facing = total[:, None, None] * moment[rows], total[:, None] * normal[rows]
-    for own, added, to, share in _weighted(patches, area, patches.center, normal, rows, shape):
+    for own, added, to, share in _weighted(patches, patches.center, normal, rows, shape):
         offset = patches.center[added] - patches.center[own]
         beside = moment[added] + offset[:, :, None] * offset[:, None, :]
         total = total + _sums(share, to, size)
@@ -231,7 +228,6 @@ def _plane_normals(
 
 def _heights(
     patches: Patches,
-    area: np.ndarray,
     center: np.ndarray,
     normal: np.ndarray,
     rows: np.ndarray,
@@ -242,8 +238,8 @@ def _heights(
     A height is the mean of that above the one patch's plane and that below the other one's: on a
     sphere it is 0.
     """
-    total, summed = area[rows], np.zeros(len(rows))
-    for own, added, to, share in _weighted(patches, area, center, normal, rows, shape):
+    total, summed = patches.area[rows], np.zeros(len(rows))
+    for own, added, to, share in _weighted(patches, center, normal, rows, shape):
         between = 0.5 * (normal[own] + normal[added])
         height = dot(center[added] - center[own], between)
         total = total + _sums(share, to, len(rows))
@@ -253,7 +249,6 @@ def _heights(
 
 def _weighted(
     patches: Patches,
-    area: np.ndarray,
     center: np.ndarray,
     normal: np.ndarray,
     rows: np.ndarray,
@@ -265,7 +260,7 @@ def _weighted(
         For P pairs, in batches: the rows of both, the places of the first ones in `rows`, and the
         weights of the second ones, (P,) each.
     """
-    place = np.full(len(area), -1)
+    area, place = patches.area, np.full(len(patches.voxel), -1)
     place[rows] = np.arange(len(rows))
     shift = patches.center - patches.voxel - 0.5
     for own, added in _batches(neighbors(patches.voxel, shape, _OFFSETS, rows)):
@@ -282,7 +277,6 @@ def _weighted(
 
 def _merge(
     patches: Patches,
-    area: np.ndarray,
     center: np.ndarray,
     normal: np.ndarray,
     rows: np.ndarray,
@@ -292,7 +286,6 @@ def _merge(
 
     Args:
         patches: Before the given ones moved.
-        area: Their areas, (M,) voxels^2.
         center: Where they have moved to, (M, 3) voxels.
         normal: Of the planes that they lie on now, (M, 3).
         rows: Of those that have moved, (K,).
@@ -303,7 +296,7 @@ def _merge(
     """
     voxel = patches.voxel.copy()
     voxel[rows] = np.clip(np.floor(center[rows]).astype(int), 0, np.subtract(shape, 1))
-    moved = np.zeros(len(area), bool)
+    area, moved = patches.area, np.zeros(len(patches.voxel), bool)
     moved[rows] = True
     while True:
         flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), shape))
@@ -327,7 +320,7 @@ def _merge(
     kept = np.setdiff1d(np.arange(len(area)), met)
     height = dot(center - patches.center, normal)[met]
     moved_to = patches._replace(voxel=voxel, center=center).part(met)
-    merged, spread = _means(moved_to, area[met], normal[met], height, group)
+    merged, spread = _means(moved_to, normal[met], height, group)
     return Joined(
         Patches(*map(np.concatenate, zip(merged, patches.part(kept), strict=True))),
         np.repeat([True, False], [len(spread), len(kept)]),
@@ -336,13 +329,12 @@ def _merge(
 
 
 def _means(
-    patches: Patches, area: np.ndarray, normal: np.ndarray, height: np.ndarray, group: np.ndarray
+    patches: Patches, normal: np.ndarray, height: np.ndarray, group: np.ndarray
 ) -> tuple[Patches, np.ndarray]:
     """Averages patches in the same voxel, by area.
 
     Args:
         patches: Where they have moved to.
-        area: Their areas, (M,) voxels^2.
         normal: Of the planes that they lie on, (M, 3).
         height: How far they have moved along it, (M,) voxels.
         group: Numbers of their voxels, 0 to N - 1, (M,).
@@ -352,7 +344,7 @@ def _means(
         (N,) voxels.
     """
     _, first = np.unique(group, return_index=True)
-    area = np.maximum(area, 1e-12)
+    area = np.maximum(patches.area, 1e-12)
     weight = area / np.bincount(group, area)[group]
 
     def mean(values: np.ndarray) -> np.ndarray:
