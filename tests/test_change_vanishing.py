@@ -209,9 +209,9 @@ def test_a_patch_that_no_ray_passes_goes_with_its_neighbors(monkeypatch, gone, l
 
 
 @pytest.mark.parametrize(
-    ("gone", "crossed", "vanishes"), [(4, 1, True), (3, 1, False), (4, 0, False)]
+    ("gone", "crossed", "vanishes"), [(3, 1, True), (2, 1, False), (3, 0, False)]
 )
-def test_a_patch_that_one_ray_crosses_goes_with_four_neighbors(
+def test_a_patch_that_one_ray_crosses_goes_with_three_neighbors(
     monkeypatch, gone, crossed, vanishes
 ):
     """A thin leg: one ray never crosses two quarters of its patch."""

@@ -38,7 +38,9 @@ def test_the_plane_decides_near_a_sure_patch_and_the_rays_elsewhere(name):
     offset = tuple(jnp.asarray([value]) for value in (0.0, 0.0, height))
     sure = jnp.asarray([hits >= distance._SURE_HITS])
     marked = jnp.asarray([abs(height) < distance._HIDDEN_REACH_VOXELS])
-    sign, side = distance._side(*counts, here, offset, *map(tuple, axes[1:]), sure, marked)
+    sign, side = distance._side(
+        *counts, here, offset, *map(tuple, axes[1:]), sure, jnp.zeros(1, bool), marked
+    )
     value = float(sign[0]) or 1.0  # no side at all counts as free
     assert value == expected
     by_plane = hits >= distance._SURE_HITS and abs(height) < 1 and "all rays" not in name
@@ -56,7 +58,7 @@ def test_a_sheet_has_free_space_on_both_sides():
         passes = jnp.zeros(shape).at[1, 1, 2].set(free)
         sure = jnp.asarray([True])
         sign, side = distance._side(
-            passes, jnp.zeros(shape), here, offset, middle, short, sure, sure
+            passes, jnp.zeros(shape), here, offset, middle, short, sure, ~sure, sure
         )
         assert float(sign[0]) == expected
         assert int(side[0]) == (Side.SHEET if free else Side.PLANE)

@@ -25,8 +25,10 @@ _FAR_VOXELS = (1.0, 1.5)
 # Free space this far behind a patch makes it a sheet: beyond the margin of the passes, voxels.
 _SHEET_VOXELS = 2.0
 
-# Where no ray passed, the plane of a patch decides the side up to this distance, voxels.
+# Where no ray passed, the plane of a patch decides the side up to this distance, voxels. A new
+# surface decides less: beside something that moves, a LiDAR does not see what lies above its rings.
 _GUESS_VOXELS = 3.0
+_GUESS_NEW_VOXELS = 1.0
 
 # The plane of a patch of fewer hits is uncertain: its normal may face away from the sensor.
 _SURE_HITS = 10.0
@@ -106,7 +108,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     within = window.within
     part = Part(within, inner)
     larger = with_margin(shape, part)
-    hits, passes, behind, root_weight, mean, axes = (
+    hits, passes, behind, root_weight, mean, axes, change = (
         geometry.read_window(array, start, shape)
         for array in (
             grid.evidence.hits,
@@ -115,6 +117,7 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
             grid.evidence.root_weight,
             grid.evidence.mean,
             grid.evidence.axes,
+            grid.evidence.change,
         )
     )
     hits, passes, behind, root_weight = (
@@ -139,8 +142,9 @@ def _distances_in(config: Config, grid: Grid, window: Window) -> Derived:
     here_zero = each(jnp.zeros_like, mean)
     offset = patches.nearest_on_patch(here_zero, mean, (long, middle), jump).offset
     sure = hits.ravel()[row] >= _SURE_HITS
+    new = change.ravel()[row] > 0
     marked = squared < _HIDDEN_REACH_VOXELS**2
-    sign, side = _side(passes, behind, here, offset, middle, short, sure, marked)
+    sign, side = _side(passes, behind, here, offset, middle, short, sure, new, marked)
     signed_m = sign * length(offset) * config.voxel_size
     sdf = jnp.where(found, signed_m, config.distance_horizon)
     side = jnp.where(found, side, Side.UNKNOWN)
@@ -187,6 +191,7 @@ def _side(
     middle: Vector,
     short: Vector,
     sure: jax.Array,
+    new: jax.Array,
     marked: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Computes the sign of voxels' centers: +1 in free space, -1 behind surfaces.
@@ -204,6 +209,7 @@ def _side(
         middle: The second principal axis of that patch, (...) each.
         short: Its third axis, along the normal, (...) each.
         sure: That patch has enough hits for a plane, (...) bool.
+        new: That patch is on a surface that has just appeared, (...) bool.
         marked: The center is so near to some hits that `behind` may be due to them, (...) bool.
 
     Returns:
@@ -222,7 +228,8 @@ def _side(
     probe = each(lambda b, n: jnp.clip(jnp.round(b).astype(jnp.int32), 0, n - 1), beyond, shape)
     sheet = free[geometry.flat_index(shape, probe)]
     own = geometry.flat_index(shape, here)
-    unobserved = jnp.where(distance < _GUESS_VOXELS, jnp.where(in_front, 1.0, -1.0), 0.0)
+    near = distance < jnp.where(new, _GUESS_NEW_VOXELS, _GUESS_VOXELS)
+    unobserved = jnp.where(near, jnp.where(in_front, 1.0, -1.0), 0.0)
     by_rays = jnp.where((behind[own] > 0) & marked, -1.0, unobserved)
     start, end = _FAR_VOXELS
     far = jnp.clip((distance - start) / (end - start), 0, 1)

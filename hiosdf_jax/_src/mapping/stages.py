@@ -14,7 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient as constant  # derivatives take it as it is
 
-from hiosdf_jax._src.change import directions, hiding, novelty, robot, smoothing, stray, vanishing
+from hiosdf_jax._src.change import (
+    directions,
+    hiding,
+    leftovers,
+    novelty,
+    robot,
+    smoothing,
+    stray,
+    vanishing,
+)
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import carving, distance, evidence, frontier, patches, rays, windows
 from hiosdf_jax._src.grid.rays import Rays
@@ -164,6 +173,13 @@ def read_window(step: Step) -> Step:
     return step._replace(before=window, window=window)
 
 
+def fade_leftovers(step: Step) -> Step:
+    """Lets the cloud outweigh old hits beside what has just vanished."""
+    window = leftovers.fade_leftovers(step.config, constant(step.window), constant(step.rays))
+    window = _with_patches(window, step.window)
+    return step._replace(before=window, window=window)
+
+
 def fuse_hits(step: Step) -> Step:
     """Merges the returns into surface patches (IV-B)."""
     return step._replace(window=patches.fuse_hits(step.config, step.window, step.rays))
@@ -276,6 +292,7 @@ CHECKS: tuple[Stage, ...] = (place_cloud, drop_stray, smooth_ranges, compare_clo
 FUSION: tuple[Stage, ...] = (
     calibrate_bound,
     read_window,
+    fade_leftovers,
     fuse_hits,
     trace_rays,
     renew_evidence,
