@@ -177,6 +177,15 @@ def test_new_surfaces_vanish_at_once():
         new = patch()._replace(change=jnp.zeros(SHAPE, jnp.int8).at[CELL].set(5))
         after, _ = scan(new, through(QUARTERS[quarters][0]))
         assert (state_of(after) == (0, -72)) == gone
+    # It may have moved by less than a voxel.
+    for beyond, gone in ((0.02, False), (0.075, True)):
+        ends = through(ALL)
+        ahead = ends - SENSOR
+        at_patch = (CENTER[0] - SENSOR[0]) / ahead[:, :1]
+        unit = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+        behind = SENSOR + at_patch * ahead + beyond * unit
+        after, _ = scan(new, behind[behind[:, 0] > 0.4])
+        assert (state_of(after) == (0, -72)) == gone
     # Not where no ray looks, and not where something stands before it.
     for ends in (through(ASIDE), CENTER - [0.2, 0, 0] + 0.001 * through(ALL)):
         kept, _ = scan(new, ends)
@@ -208,23 +217,76 @@ def test_a_patch_that_no_ray_passes_goes_with_its_neighbors(monkeypatch, gone, l
     assert (state_of(after) == (0, -72)) == vanishes
 
 
+CORNERS = [(1, 1, 1), (1, -1, 1), (1, 1, -1), (1, -1, -1)]
+THING = [(-4, y, z) for y in range(-3, 3) for z in range(-3, 3)]
+
+
 @pytest.mark.parametrize(
-    ("gone", "crossed", "vanishes"), [(3, 1, True), (2, 1, False), (3, 0, False)]
+    ("gone", "thing", "crossed", "vanishes"),
+    [
+        (4, False, 1, True),
+        (3, False, 1, False),
+        (4, False, 0, False),
+        (3, True, 1, True),
+        (2, True, 1, False),
+        (3, True, 0, False),
+    ],
 )
-def test_a_patch_that_one_ray_crosses_goes_with_three_neighbors(
-    monkeypatch, gone, crossed, vanishes
+def test_a_patch_that_one_ray_crosses_goes_with_its_neighbors(
+    monkeypatch, gone, thing, crossed, vanishes
 ):
     """A thin leg: one ray never crosses two quarters of its patch."""
     monkeypatch.setitem(globals(), "SENSOR", np.array([-1.9, 0.55, 0.65]))
     window = patch()
     change = np.zeros(SHAPE, np.int8)
-    for step in [(1, 1, 1), (1, -1, 1), (1, 1, -1), (1, -1, -1)][:gone]:
+    for step in CORNERS[:gone] + THING * thing:
         change[tuple(np.add(CELL, step))] = -72
-    window = window._replace(change=jnp.asarray(change))
+    # Another patch is left, in front of which nothing has vanished.
+    hits = window.hits.at[tuple(np.add(CELL, (2, 0, 0)))].set(50)
+    window = window._replace(change=jnp.asarray(change), hits=hits)
     aside = square(0.12, 25)
     aside = aside[np.abs(aside).max(axis=1) > 0.055]
     ends = through(np.concatenate([aside, np.array([[0.02, 0.015]])[:crossed]]))
     after, _ = scan(window, ends)
+    assert (state_of(after) == (0, -72)) == vanishes
+
+
+@pytest.mark.parametrize(
+    ("gone", "thing", "rays", "passes", "left", "vanishes"),
+    [
+        (4, True, 8, 0, True, True),
+        (4, False, 8, 0, True, False),
+        (3, True, 8, 0, True, False),
+        (4, True, 1, 900, True, False),
+        (4, True, 1, 900, False, True),
+        (4, False, 1, 900, False, False),
+    ],
+)
+def test_a_patch_of_a_thing_goes_if_rays_miss_it(
+    monkeypatch, gone, thing, rays, passes, left, vanishes
+):
+    """Rays pass the edge of its voxel, where no patch is.
+
+    A tenth of all rays ended in it if 900 passed: one that passes says little, unless nothing else
+    is left.
+    """
+    monkeypatch.setitem(globals(), "SENSOR", np.array([-1.9, 0.55, 0.65]))
+    window = patch()
+    change = np.zeros(SHAPE, np.int8)
+    for step in CORNERS[:gone] + THING * thing:
+        change[tuple(np.add(CELL, step))] = -72
+    hits = window.hits
+    if left:
+        hits = hits.at[tuple(np.add(CELL, (2, 0, 0)))].set(50)
+    window = window._replace(
+        change=jnp.asarray(change), hits=hits, passes=window.passes.at[CELL].set(passes)
+    )
+    beside = np.stack([np.linspace(-0.03, 0.03, rays), np.full(rays, 0.0465)], axis=1)
+    aside = square(0.12, 25)
+    aside = aside[np.abs(aside).max(axis=1) > 0.055]
+    ends = through(np.concatenate([aside, beside]))
+    after, traced = scan(window, ends)
+    assert float(traced.passes[CELL]) > passes
     assert (state_of(after) == (0, -72)) == vanishes
 
 

@@ -48,6 +48,26 @@ def test_the_plane_decides_near_a_sure_patch_and_the_rays_elsewhere(name):
     assert int(side[0]) == (Side.PLANE if by_plane else int(sign[0]))
 
 
+@pytest.mark.parametrize(("height", "sign"), [(-0.9, -1), (-1.1, 0), (-2.9, 0), (1.1, 0), (0.9, 1)])
+def test_the_plane_of_a_new_surface_decides_less_of_unmet_space(height, sign):
+    """What moves may have left it: an old surface decides up to three voxels."""
+    shape = (3, 3, 12)
+    here = tuple(jnp.asarray([k]) for k in (1, 1, 8))
+    middle, short = ([0, 0.4, 0], [0, 0, 0.05])
+    middle, short = (tuple(jnp.asarray(axis)[:, None]) for axis in (middle, short))
+    offset = tuple(jnp.asarray([value]) for value in (0.0, 0.0, height))
+    none, yes = jnp.zeros(shape), jnp.asarray([True])
+    for new, expected in ((yes, sign), (~yes, np.sign(height))):
+        found, side = distance._side(none, none, here, offset, middle, short, yes, new, yes)
+        assert float(found[0]) == expected
+        if abs(height) > 1:
+            assert int(side[0]) == expected
+    # Rays that ended before the voxel decide as ever.
+    behind = none.at[1, 1, 8].set(2)
+    found, _ = distance._side(none, behind, here, offset, middle, short, yes, yes, yes)
+    assert float(found[0]) == (-1 if abs(height) > 1 else np.sign(height))
+
+
 def test_a_sheet_has_free_space_on_both_sides():
     shape = (3, 3, 12)
     here = tuple(jnp.asarray([k]) for k in (1, 1, 4))

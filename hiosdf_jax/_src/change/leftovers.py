@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from hiosdf_jax._src.change.vanishing import has_vanished
+from hiosdf_jax._src.change.vanishing import has_vanished, where_things_left
 from hiosdf_jax._src.config import Config
 from hiosdf_jax._src.grid import geometry
 from hiosdf_jax._src.grid.evidence import EvidenceWindow
@@ -23,7 +23,7 @@ _OLD_PER_NEW = 0.25
 
 
 def fade_leftovers(config: Config, window: EvidenceWindow, rays: Rays) -> EvidenceWindow:
-    """Lets the hits of a cloud outweigh older ones, up to two voxels from a vanished surface.
+    """Lets the hits of a cloud outweigh older ones, up to two voxels from where a thing has left.
 
     Hits, passes and behind are scaled alike: what was surface or free stays so. With the new hits,
     a patch has at least `min_hits`.
@@ -46,7 +46,7 @@ def fade_leftovers(config: Config, window: EvidenceWindow, rays: Rays) -> Eviden
         new = jnp.zeros(size, jnp.float32).at[voxel].add(1, mode="drop").reshape(shape)
         most = jnp.maximum(_OLD_PER_NEW * new, config.min_hits - new)
         share = jnp.minimum(most / jnp.maximum(window.hits, 1), 1)
-        beside = with_neighbors(with_neighbors(vanished))
+        beside = with_neighbors(with_neighbors(vanished)) & where_things_left(window.change)
         share = jnp.where(beside & (new > 0) & (window.hits > 0), share, 1)
         return window._replace(
             hits=share * window.hits,

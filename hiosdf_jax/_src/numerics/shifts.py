@@ -71,3 +71,14 @@ def with_neighbors(mask: jax.Array) -> jax.Array:
         return mask
 
     return cond(jnp.any(mask), grow, lambda mask: mask, mask)
+
+
+def count_around(mask: jax.Array, reach: int) -> jax.Array:
+    """Counts the voxels of a mask (X, Y, Z) at most `reach` voxels away along each axis, int32."""
+    counts = mask.astype(jnp.int32)
+    for axis in range(mask.ndim):
+        padded = pad_axis(counts, axis, reach)
+        counts = sum(
+            (padded.shifted(k) for k in range(1 - reach, reach + 1)), padded.shifted(-reach)
+        )
+    return counts
