@@ -267,8 +267,7 @@ def test_a_patch_of_a_thing_goes_if_rays_miss_it(
 ):
     """Rays pass the edge of its voxel, where no patch is.
 
-    A tenth of all rays ended in it if 900 passed: one that passes says little, unless nothing else
-    is left.
+    Of 1,000 rays 100 ended in it: one more that passes says little, unless no other patch is left.
     """
     monkeypatch.setitem(globals(), "SENSOR", np.array([-1.9, 0.55, 0.65]))
     window = patch()

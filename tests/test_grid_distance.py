@@ -50,7 +50,7 @@ def test_the_plane_decides_near_a_sure_patch_and_the_rays_elsewhere(name):
 
 @pytest.mark.parametrize(("height", "sign"), [(-0.9, -1), (-1.1, 0), (-2.9, 0), (1.1, 0), (0.9, 1)])
 def test_the_plane_of_a_new_surface_decides_less_of_unmet_space(height, sign):
-    """What moves may have left it: an old surface decides up to three voxels."""
+    """That of an old one decides up to three voxels, and not only up to one."""
     shape = (3, 3, 12)
     here = tuple(jnp.asarray([k]) for k in (1, 1, 8))
     middle, short = ([0, 0.4, 0], [0, 0, 0.05])

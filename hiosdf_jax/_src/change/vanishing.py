@@ -46,8 +46,8 @@ _SEVERAL_RAYS = 3
 _GONE = -72
 _FORGOTTEN = -64
 
-# A thing has left where this many voxels have vanished, up to this many voxels away. Where fewer
-# have, thin parts may have met no ray for a while.
+# A thing has left where at least this many voxels have vanished, at most this many voxels away
+# along each axis. Fewer may be parts of a thin thing that stays: rays missed them for a while.
 _THING_VOXELS = 16
 _THING_REACH = 4
 
@@ -59,9 +59,11 @@ _LEAST_GONE_NEIGHBORS = 8
 # of house_depth, house_lidar and the demo stay as they are or fall by 1 %.
 _LEAST_GONE_IF_MET = 4
 
-# The same where a thing has left. The second number is for a patch that all rays see past without
-# crossing it. No other patch is up to two voxels away, or so many rays pass its voxel that one of
-# them would have ended there, by the share of the rays that did so far.
+# The same where a thing has left. A patch that no ray crosses needs one more, if all rays see past
+# it and one of these holds: it is the only patch left up to two voxels away, or at least one of the
+# cloud's rays through its voxel should have ended there, by the share of all rays that did. Where a
+# thing has left, one ray through a patch also suffices with `_LEAST_GONE_NEIGHBORS`, if other rays
+# do not see past it.
 _LEAST_GONE_OF_THING_IF_MET = 3
 _LEAST_GONE_OF_THING = 4
 _SPREADS = 5  # in one scan
@@ -84,7 +86,9 @@ def drop_vanished(
 ) -> EvidenceWindow:
     """Removes patches that several scans have looked through since a ray last ended on them.
 
-    A patch on a new surface is removed by one scan that looks past it: it may have moved on.
+    A patch on a new surface is removed by one scan that looks half a voxel past it: it may have
+    moved on. The remains of a thing are removed when enough voxels around them have vanished, and
+    fewer suffice where a whole thing has left.
 
     Args:
         config: The map's configuration.
@@ -149,8 +153,9 @@ def drop_vanished(
             most = looked_at.ravel()[row] | (count >= _LEAST_GONE_RATIO * left)
             least_if_met = jnp.where(thing, _LEAST_GONE_OF_THING_IF_MET, _LEAST_GONE_IF_MET)
             least = jnp.where(looked_past & met, least_if_met, _LEAST_GONE_NEIGHBORS)
-            missing = thing & looked_past & (missed | (left <= 1))  # itself
-            enough = count >= jnp.where(missing, jnp.minimum(least, _LEAST_GONE_OF_THING), least)
+            # `left` counts the patch itself.
+            remnant = thing & looked_past & (missed | (left <= 1))
+            enough = count >= jnp.where(remnant, jnp.minimum(least, _LEAST_GONE_OF_THING), least)
             seen = looked_past | (met & (thing | (crossed > 0)))
             return vanished | (enough & most & seen)
 
@@ -195,7 +200,7 @@ def has_vanished(change: jax.Array) -> jax.Array:
 
 
 def where_things_left(change: jax.Array) -> jax.Array:
-    """Returns a mask of the voxels near which a thing has left, and not only a few patches.
+    """Returns a mask of the voxels near which so many have vanished that a whole thing has left.
 
     Args:
         change: As in `Evidence`, (X, Y, Z).

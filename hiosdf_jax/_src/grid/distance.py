@@ -25,8 +25,8 @@ _FAR_VOXELS = (1.0, 1.5)
 # Free space this far behind a patch makes it a sheet: beyond the margin of the passes, voxels.
 _SHEET_VOXELS = 2.0
 
-# Where no ray passed, the plane of a patch decides the side up to this distance, voxels. A new
-# surface decides less: beside something that moves, a LiDAR does not see what lies above its rings.
+# Where no ray passed, the plane of a patch decides the side up to this distance, voxels. That of a
+# new surface decides less: beside a thing that moves, a LiDAR sees nothing above its rings.
 _GUESS_VOXELS = 3.0
 _GUESS_NEW_VOXELS = 1.0
 

@@ -250,16 +250,33 @@ def least_hit_ratio(
     Returns:
         hits / (hits + passes) below which the patch is carved.
     """
-    long, middle = (
-        length(split(axes[..., axis, :].astype(jnp.float32))) * EXTENT_DEVIATIONS for axis in (0, 1)
-    )
-    area = jnp.minimum(2 * long, 1) * jnp.minimum(2 * middle, 1)
+    area = _area(axes)
     # A hit weighs (floor / sigma)^2, so this compares the harmonic mean of the variances.
     noise_floor, _ = config.range_noise
     sharp = weight * (_SHARP_VOXELS * config.voxel_size) ** 2 >= hits * noise_floor**2
-    sharp &= (area < _SMALL_AREA) & (hits >= _SHARP_HITS)
+    sharp &= is_small(axes) & (hits >= _SHARP_HITS)
     share = jnp.where(sharp, _SHARP_SHARE, 1.0)
     return share * config.min_hit_ratio * jnp.maximum(area, _LEAST_AREA)
+
+
+def is_small(axes: jax.Array) -> jax.Array:
+    """Returns a mask of the patches that fill only a part of their voxel, such as those of poles.
+
+    Args:
+        axes: As in `Evidence`, (..., 3, 3).
+
+    Returns:
+        (...) bool.
+    """
+    return _area(axes) < _SMALL_AREA
+
+
+def _area(axes: jax.Array) -> jax.Array:
+    """Computes the areas of patches, at most those of a voxel's face, (...) voxels^2."""
+    long, middle = (
+        length(split(axes[..., axis, :].astype(jnp.float32))) * EXTENT_DEVIATIONS for axis in (0, 1)
+    )
+    return jnp.minimum(2 * long, 1) * jnp.minimum(2 * middle, 1)
 
 
 def is_behind_surface(hits: jax.Array, passes: jax.Array, behind: jax.Array) -> jax.Array:

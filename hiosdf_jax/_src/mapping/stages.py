@@ -174,7 +174,7 @@ def read_window(step: Step) -> Step:
 
 
 def fade_leftovers(step: Step) -> Step:
-    """Lets the cloud outweigh old hits beside what has just vanished."""
+    """Lets new hits outweigh old ones beside a thing that has just left."""
     window = leftovers.fade_leftovers(step.config, constant(step.window), constant(step.rays))
     window = _with_patches(window, step.window)
     return step._replace(before=window, window=window)
@@ -355,7 +355,7 @@ def _with_patches(
 ) -> evidence.EvidenceWindow:
     """Gives a window the patches of another one, which carry the derivatives.
 
-    The stages between have changed its counts alone.
+    The stages between have changed its counts and weights alone.
     """
     return window._replace(mean=patched.mean, axes=patched.axes)
 

@@ -74,7 +74,15 @@ def with_neighbors(mask: jax.Array) -> jax.Array:
 
 
 def count_around(mask: jax.Array, reach: int) -> jax.Array:
-    """Counts the voxels of a mask (X, Y, Z) at most `reach` voxels away along each axis, int32."""
+    """Counts the voxels of a mask in the cube around each voxel.
+
+    Args:
+        mask: (X, Y, Z) bool. Voxels outside of it count as False.
+        reach: Half the edge of the cube, without the voxel itself.
+
+    Returns:
+        (X, Y, Z) int32.
+    """
     counts = mask.astype(jnp.int32)
     for axis in range(mask.ndim):
         padded = pad_axis(counts, axis, reach)
