@@ -151,13 +151,13 @@ def drop_vanished(
             count = jnp.sum(inside & gone, axis=1)
             left = jnp.sum(mapped & ~gone, axis=1)
             most = looked_at.ravel()[row] | (count >= _LEAST_GONE_RATIO * left)
-            least_if_met = jnp.where(thing, _LEAST_GONE_OF_THING_IF_MET, _LEAST_GONE_IF_MET)
-            least = jnp.where(looked_past & met, least_if_met, _LEAST_GONE_NEIGHBORS)
             # `left` counts the patch itself.
             remnant = thing & looked_past & (missed | (left <= 1))
-            enough = count >= jnp.where(remnant, jnp.minimum(least, _LEAST_GONE_OF_THING), least)
+            least = jnp.where(remnant, _LEAST_GONE_OF_THING, _LEAST_GONE_NEIGHBORS)
+            least_if_met = jnp.where(thing, _LEAST_GONE_OF_THING_IF_MET, _LEAST_GONE_IF_MET)
+            least = jnp.where(looked_past & met, least_if_met, least)
             seen = looked_past | (met & (thing | (crossed > 0)))
-            return vanished | (enough & most & seen)
+            return vanished | ((count >= least) & most & seen)
 
         return jax.lax.fori_loop(0, _SPREADS, once, vanished)
 
@@ -200,7 +200,7 @@ def has_vanished(change: jax.Array) -> jax.Array:
 
 
 def where_things_left(change: jax.Array) -> jax.Array:
-    """Returns a mask of the voxels near which so many have vanished that a whole thing has left.
+    """Returns a mask of the voxels near which a whole thing has left: many voxels have vanished.
 
     Args:
         change: As in `Evidence`, (X, Y, Z).
@@ -241,7 +241,11 @@ def _met(before: EvidenceWindow, window: EvidenceWindow) -> tuple[jax.Array, jax
 def _look(
     config: Config, window: EvidenceWindow, rays: Rays, view: View, row: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns doubt in patches, and masks of those that a ray crosses, and that all see past."""
+    """Returns doubt in patches, and masks of those that a ray crosses, and that all rays see past.
+
+    Rays see past an old surface if they go a voxel farther, and past a new one from
+    `_PAST_NEW_VOXELS` on.
+    """
     size, shape = config.voxel_size, window.hits.shape
     index = jnp.stack(jnp.unravel_index(row, shape), axis=-1)
     mean = take(window.mean.reshape(-1, 3), row)
