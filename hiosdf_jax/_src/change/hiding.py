@@ -51,13 +51,16 @@ def add_new_surfaces(
     point_world = split(rays.points_world)
     index, inside = geometry.window_voxel_around(config, window.start, shape, point_world)
     voxel = geometry.flat_index(shape, index)
-    target = jnp.where(novelty.novel & inside, voxel, window.hits.size)
+    size = window.hits.size
     # Next to a new surface a single one will do: it belongs to the same thing.
     count = jnp.where(novelty.near_new, _LEAST_NOVEL_HITS, 1)
-    novel_hits = jnp.zeros(window.hits.size, jnp.int32).at[target].add(count, mode="drop")
-    novel_hits = novel_hits.reshape(shape)
+    kinds = jnp.stack([jnp.where(novelty.novel, count, 0), novelty.beside_new.astype(jnp.int32)])
+    target = jnp.where(inside, voxel, size)
+    counts = jnp.zeros((2, size), jnp.int32).at[:, target].add(kinds, mode="drop")
+    novel_hits, hits_beside = counts.reshape(2, *shape)
     appeared = novel_hits >= _LEAST_NOVEL_HITS
-    appeared |= (novel_hits > 0) & with_neighbors(appeared)
+    belongs = (novel_hits > 0) | (hits_beside >= _LEAST_NOVEL_HITS)
+    appeared |= belongs & with_neighbors(appeared)
 
     new_hits = window.hits - before.hits
     new_passes = jnp.maximum(window.passes - jnp.abs(before.passes), 0)
