@@ -124,7 +124,11 @@ def drop_vanished(
     hits = window.hits.ravel()[row]
     doubt = jnp.where(old > 0, 0, -old) + crossed
     needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
-    vanished = ((crossed > 0) & (doubt >= needed)) | ((old > 0) & looked_past)
+    passes = jnp.abs(window.passes.ravel()[row])
+    new_passes = passes - jnp.abs(before.passes.ravel()[row])
+    missed = new_passes * hits >= hits + passes
+    moved_on = (old > 0) & looked_past & (missed | (hits >= passes))
+    vanished = ((crossed > 0) & (doubt >= needed)) | moved_on
     counted = jnp.where(old > 0, old, -jnp.minimum(doubt, -_FORGOTTEN))
 
     def put(array: jax.Array, values: jax.Array) -> jax.Array:
@@ -140,9 +144,6 @@ def drop_vanished(
         """Adds the remains of objects: edges that few rays meet vanish with their objects."""
         around, inside = _around(change.shape, row)
         mapped = inside & (window.hits.ravel()[around] > 0)
-        passes = jnp.abs(window.passes.ravel()[row])
-        new_passes = passes - jnp.abs(before.passes.ravel()[row])
-        missed = new_passes * hits >= hits + passes
 
         def once(_: jax.Array, vanished: jax.Array) -> jax.Array:
             now = put(change, jnp.where(vanished, mark, counted))
