@@ -178,6 +178,7 @@ def renew(count, near_new=False, novel=True, passes=40.0, hits=0.0, change=0, be
     window = window._replace(passes=window.passes.at[CELL].set(moved))
     found = Novelty(
         novel=jnp.asarray(ended & novel),
+        beside_new=jnp.asarray(ended),
         near_new=jnp.asarray(ended & near_new),
         consistent=jnp.asarray(True),
         noise=jnp.asarray(False),
@@ -238,6 +239,7 @@ def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset,
     ended = np.asarray(rays.in_range)
     found = Novelty(
         novel=jnp.asarray(ended),
+        beside_new=jnp.zeros(ROWS, bool),
         near_new=jnp.zeros(ROWS, bool),
         consistent=jnp.asarray(True),
         noise=jnp.asarray(False),
@@ -247,3 +249,34 @@ def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset,
     assert float(result.passes[CELL]) == 0
     assert float(result.passes[other]) == (0 if new else 40)
     assert np.asarray(fresh).sum() == (4 if new else 3)
+
+
+@pytest.mark.parametrize(
+    ("offset", "count", "beside", "new"),
+    [
+        ((0, 0, -0.1), 3, True, True),
+        ((0, 0, -0.1), 2, True, False),
+        ((0, 0, -0.1), 3, False, False),
+        ((0, 0, -0.2), 3, True, False),
+    ],
+)
+def test_returns_nearer_to_the_floor_join_a_new_surface(offset, count, beside, new):
+    middle = np.array([0.35, 0.55, 0.65])
+    ends = middle + np.concatenate([np.zeros((3, 3)), np.tile(offset, (count, 1))])
+    rays = rays_of(ends)
+    start = empty_window()
+    start = start._replace(passes=jnp.full_like(start.passes, 40.0))
+    lower = np.arange(ROWS) >= 3
+    ended = np.asarray(rays.in_range)
+    found = Novelty(
+        novel=jnp.asarray(ended & ~lower),
+        beside_new=jnp.asarray(ended & (beside | ~lower)),
+        near_new=jnp.zeros(ROWS, bool),
+        consistent=jnp.asarray(True),
+        noise=jnp.asarray(False),
+    )
+    result, fresh = add_new(CONFIG, start, fuse_hits(CONFIG, start, rays), rays, found)
+    other = tuple(np.add(CELL, np.round(np.array(offset) / 0.1).astype(int)))
+    assert float(result.passes[CELL]) == 0
+    assert float(result.passes[other]) == (0 if new else 40)
+    assert np.asarray(fresh).sum() == 3 + new * count

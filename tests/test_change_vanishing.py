@@ -186,6 +186,11 @@ def test_new_surfaces_vanish_at_once():
         behind = SENSOR + at_patch * ahead + beyond * unit
         after, _ = scan(new, behind[behind[:, 0] > 0.4])
         assert (state_of(after) == (0, -72)) == gone
+    # A part so thin that most rays miss it stays if no ray had to end on it.
+    for passes, gone in ((80.0, True), (101.0, True), (9e4, False)):
+        thin = new._replace(passes=new.passes.at[CELL].set(passes))
+        after, _ = scan(thin, through(ALL))
+        assert (state_of(after) == (0, -72)) == gone
     # Not where no ray looks, and not where something stands before it.
     for ends in (through(ASIDE), CENTER - [0.2, 0, 0] + 0.001 * through(ALL)):
         kept, _ = scan(new, ends)

@@ -231,7 +231,7 @@ def test_random_points_are_always_refused(sharp_map):
             report=sharp_map.report.replace(refused_in_row=jnp.int32(refused)),
         )
         step = stages.begin(state, jnp.asarray(cloud), jnp.ones(len(cloud), bool), pose)
-        found = novelty.Novelty(*4 * [jnp.asarray(False)])._replace(noise=jnp.asarray(noise))
+        found = novelty.Novelty(*5 * [jnp.asarray(False)])._replace(noise=jnp.asarray(noise))
         flags = jnp.uint32(hio.Flag.INCONSISTENT_CLOUD)
         assert bool(stages.is_accepted(step._replace(novelty=found, flags=flags))) == accepted
 
