@@ -252,15 +252,15 @@ def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset,
 
 
 @pytest.mark.parametrize(
-    ("offset", "count", "beside", "new"),
+    ("offset", "count", "beside", "hides"),
     [
         ((0, 0, -0.1), 3, True, True),
-        ((0, 0, -0.1), 2, True, False),
+        ((0, 0, -0.1), 1, True, True),
         ((0, 0, -0.1), 3, False, False),
         ((0, 0, -0.2), 3, True, False),
     ],
 )
-def test_returns_nearer_to_the_floor_join_a_new_surface(offset, count, beside, new):
+def test_returns_near_the_floor_hide_space_beside_a_new_surface(offset, count, beside, hides):
     middle = np.array([0.35, 0.55, 0.65])
     ends = middle + np.concatenate([np.zeros((3, 3)), np.tile(offset, (count, 1))])
     rays = rays_of(ends)
@@ -278,5 +278,6 @@ def test_returns_nearer_to_the_floor_join_a_new_surface(offset, count, beside, n
     result, fresh = add_new(CONFIG, start, fuse_hits(CONFIG, start, rays), rays, found)
     other = tuple(np.add(CELL, np.round(np.array(offset) / 0.1).astype(int)))
     assert float(result.passes[CELL]) == 0
-    assert float(result.passes[other]) == (0 if new else 40)
-    assert np.asarray(fresh).sum() == 3 + new * count
+    assert float(result.passes[other]) == 40
+    assert int(result.change[other]) == 0
+    assert np.asarray(fresh).sum() == 3 + hides * count

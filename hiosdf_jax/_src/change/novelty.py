@@ -22,7 +22,8 @@ from hiosdf_jax._src.state.pytrees import Grid
 # A novel return is this far from every surface, beside three standard deviations of its range.
 _NOVEL_VOXELS = 1.5
 
-# The same for a return next to a new surface: the lowest part of a thing that stands on the floor.
+# Next to a new surface a return hides space from this distance on: it may be on the lowest part of
+# a thing that stands on the floor.
 _BESIDE_VOXELS = 0.5
 
 
@@ -31,7 +32,8 @@ class Novelty(NamedTuple):
 
     Attributes:
         novel: The return is in space that was free, (N,) bool.
-        beside_new: The same, but nearer to known surfaces: new if it is next to a new surface.
+        beside_new: The same, nearer to known surfaces. It belongs to a new surface that is next to
+            it.
         near_new: The return is on or next to a surface that is itself new, (N,) bool.
         consistent: The cloud agrees with the map, or the map cannot judge it, () bool.
         noise: It does not, and its rays disagree with each other, () bool.
