@@ -178,7 +178,7 @@ def renew(count, near_new=False, novel=True, passes=40.0, hits=0.0, change=0, be
     window = window._replace(passes=window.passes.at[CELL].set(moved))
     found = Novelty(
         novel=jnp.asarray(ended & novel),
-        beside_new=jnp.asarray(ended),
+        may_join=jnp.asarray(ended),
         near_new=jnp.asarray(ended & near_new),
         consistent=jnp.asarray(True),
         noise=jnp.asarray(False),
@@ -239,7 +239,7 @@ def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset,
     ended = np.asarray(rays.in_range)
     found = Novelty(
         novel=jnp.asarray(ended),
-        beside_new=jnp.zeros(ROWS, bool),
+        may_join=jnp.zeros(ROWS, bool),
         near_new=jnp.zeros(ROWS, bool),
         consistent=jnp.asarray(True),
         noise=jnp.asarray(False),
@@ -270,7 +270,7 @@ def test_returns_near_the_floor_hide_space_beside_a_new_surface(offset, count, b
     ended = np.asarray(rays.in_range)
     found = Novelty(
         novel=jnp.asarray(ended & ~lower),
-        beside_new=jnp.asarray(ended & (beside | ~lower)),
+        may_join=jnp.asarray(ended & (beside | ~lower)),
         near_new=jnp.zeros(ROWS, bool),
         consistent=jnp.asarray(True),
         noise=jnp.asarray(False),
@@ -280,4 +280,9 @@ def test_returns_near_the_floor_hide_space_beside_a_new_surface(offset, count, b
     assert float(result.passes[CELL]) == 0
     assert float(result.passes[other]) == 40
     assert int(result.change[other]) == 0
+    assert np.asarray(fresh).sum() == 3 + hides * count
+    # Also while the surface next to it is still new, in a later scan.
+    later = found._replace(novel=jnp.zeros(ROWS, bool))
+    new = start._replace(change=start.change.at[CELL].set(5))
+    _, fresh = add_new(CONFIG, new, fuse_hits(CONFIG, new, rays), rays, later)
     assert np.asarray(fresh).sum() == 3 + hides * count

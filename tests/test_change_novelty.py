@@ -52,11 +52,11 @@ def cell_of(point):
 
 
 def novel_by_a_loop(grid, rays):
-    """The definition, for one return after the other: (novel, near_new, beside_new)."""
+    """The definition, for one return after the other: (novel, near_new, may_join)."""
     known, derived = grid.evidence, grid.derived
     hits, passes = np.asarray(known.hits, float), np.asarray(known.passes, float)
     sdf, change = np.asarray(derived.sdf, float), np.asarray(known.change)
-    novel, near_new, beside_new = np.zeros((3, len(rays.ends)), bool)
+    novel, near_new, may_join = np.zeros((3, len(rays.ends)), bool)
     for k, point in enumerate(np.asarray(rays.points_world, np.float64)):
         if not (rays.ends[k] and rays.inside[k]):
             continue
@@ -67,12 +67,12 @@ def novel_by_a_loop(grid, rays):
         if hits[cell] >= max(1, 0.25 * (hits[cell] + abs(passes[cell]))):
             continue  # a surface
         seen = derived.frontier_steps[cell] > 0
-        noise = 3 * float(rays.sigma[k])
+        margin = 3 * float(rays.sigma[k])
         free = seen and passes[cell] > 0
-        new = free and (sdf[cell] > 0.15 + noise or near_new[k])
+        new = free and (sdf[cell] > 0.15 + margin or near_new[k])
         novel[k] = new or (passes[cell] < 0 and near_new[k])
-        beside_new[k] = free and sdf[cell] > 0.05 + noise
-    return novel, near_new, beside_new
+        may_join[k] = free and sdf[cell] > 0.05 + margin
+    return novel, near_new, may_join
 
 
 def test_returns_in_free_space_away_from_surfaces_are_novel_and_others_are_not(grid):
@@ -88,7 +88,7 @@ def test_returns_in_free_space_away_from_surfaces_are_novel_and_others_are_not(g
     assert not np.asarray(found.near_new).any()
     expected, _, beside = novel_by_a_loop(grid, rays)
     np.testing.assert_array_equal(novel, expected)
-    np.testing.assert_array_equal(found.beside_new, beside)
+    np.testing.assert_array_equal(found.may_join, beside)
     assert not beside[1500:].any()
     assert (beside & ~novel).sum() > 100
 
@@ -105,13 +105,13 @@ def test_a_noisy_return_must_be_farther_from_surfaces(grid):
         novel = np.asarray(found.novel)
         expected, _, beside = novel_by_a_loop(grid, rays)
         np.testing.assert_array_equal(novel, expected)
-        np.testing.assert_array_equal(found.beside_new, beside)
+        np.testing.assert_array_equal(found.may_join, beside)
         assert sdf[at][novel].min() > 0.15 + 3 * noise - 1e-3
         counts.append(novel.sum())
     assert counts[0] > 1.2 * counts[1] > 1.44 * counts[2] > 0
 
 
-def test_returns_beside_new_surfaces_and_in_what_they_hide_are_novel(grid):
+def test_returns_may_join_surfaces_and_in_what_they_hide_are_novel(grid):
     """Some surface voxels are new; a corner of the room is hidden."""
     rng = np.random.default_rng(3)
     known = grid.evidence
@@ -127,9 +127,9 @@ def test_returns_beside_new_surfaces_and_in_what_they_hide_are_novel(grid):
     changed = update_frontier(CONFIG, changed, anywhere(CENTER))
     rays = rays_to(inner_points(4, 1500), SENSOR)
     found = compare(changed, rays)
-    novel, near_new, beside_new = novel_by_a_loop(changed, rays)
+    novel, near_new, may_join = novel_by_a_loop(changed, rays)
     np.testing.assert_array_equal(found.near_new, near_new)
-    np.testing.assert_array_equal(found.beside_new, beside_new)
+    np.testing.assert_array_equal(found.may_join, may_join)
     np.testing.assert_array_equal(found.novel, novel)
     at = tuple(np.transpose([cell_of(point) for point in inner_points(4, 1500)]))
     assert (novel & hidden[at]).sum() > 20

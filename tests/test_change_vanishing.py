@@ -186,15 +186,33 @@ def test_new_surfaces_vanish_at_once():
         behind = SENSOR + at_patch * ahead + beyond * unit
         after, _ = scan(new, behind[behind[:, 0] > 0.4])
         assert (state_of(after) == (0, -72)) == gone
-    # A part so thin that most rays miss it stays if no ray had to end on it.
-    for passes, gone in ((80.0, True), (101.0, True), (9e4, False)):
-        thin = new._replace(passes=new.passes.at[CELL].set(passes))
-        after, _ = scan(thin, through(ALL))
-        assert (state_of(after) == (0, -72)) == gone
     # Not where no ray looks, and not where something stands before it.
     for ends in (through(ASIDE), CENTER - [0.2, 0, 0] + 0.001 * through(ALL)):
         kept, _ = scan(new, ends)
         assert state_of(kept) == (100, 5)
+
+
+def test_a_new_part_that_most_rays_miss_becomes_old_unless_a_ray_should_have_met_it():
+    z = np.linspace(-0.035, 0.035, 12)
+    strip = CENTER + np.stack([np.zeros(12), np.resize([-0.008, 0.008], 12), z], axis=1)
+    points = np.resize(strip, (600, 3)).astype(np.float32)
+    window = fuse(empty_window(), points, SENSOR, hit=np.arange(600) < 12)
+    new = window._replace(
+        change=window.change.at[CELL].set(5), passes=window.passes.at[CELL].set(88.0)
+    )
+    few = np.array([[y, z] for y in (-0.004, 0.004) for z in (-0.004, 0.004)])
+    few = np.concatenate([few, np.zeros((1, 2))])
+    assert 5 * 12 < 12 + 93
+    once, _ = scan(new, through(few))
+    assert state_of(once) == (12, -2)
+    twice, _ = scan(once, through(few))  # 12 hits need two of three `vanish_scans`
+    assert state_of(twice) == (0, -72)
+    many = np.repeat(few, 4, axis=0)
+    assert 20 * 12 >= 12 + 108
+    at_once, _ = scan(new, through(many))
+    assert state_of(at_once) == (0, -72)
+    # Rays elsewhere leave it new.
+    assert state_of(scan(new, through(ASIDE))[0]) == (12, 5)
 
 
 @pytest.mark.parametrize(

@@ -22,25 +22,25 @@ from hiosdf_jax._src.state.pytrees import Grid
 # A novel return is this far from every surface, beside three standard deviations of its range.
 _NOVEL_VOXELS = 1.5
 
-# Next to a new surface a return hides space from this distance on: it may be on the lowest part of
-# a thing that stands on the floor.
-_BESIDE_VOXELS = 0.5
+# The same for a return that may join a new surface next to it: it may be on the lowest part of a
+# thing that stands on the floor.
+_JOINS_VOXELS = 0.5
 
 
 class Novelty(NamedTuple):
     """A cloud compared with the map before it.
 
     Attributes:
-        novel: The return is in space that was free, (N,) bool.
-        beside_new: The same, nearer to known surfaces. It belongs to a new surface that is next to
-            it.
+        novel: The return is in space that was free, or beside a new surface, (N,) bool.
+        may_join: The return is in space that was free, but may be nearer to known surfaces. If a
+            new surface is next to it, it belongs to that, (N,) bool.
         near_new: The return is on or next to a surface that is itself new, (N,) bool.
         consistent: The cloud agrees with the map, or the map cannot judge it, () bool.
         noise: It does not, and its rays disagree with each other, () bool.
     """
 
     novel: jax.Array
-    beside_new: jax.Array
+    may_join: jax.Array
     near_new: jax.Array
     consistent: jax.Array
     noise: jax.Array
@@ -73,14 +73,14 @@ def compare_cloud(config: Config, grid: Grid, rays: Rays, updates: jax.Array) ->
     observed = ends & (derived.frontier_steps.ravel()[voxel] > 0)
     hits, passes = (array.ravel()[voxel] for array in (evidence.hits, evidence.passes))
     empty = (hits < config.min_hits) | (hits < config.min_hit_ratio * (hits + jnp.abs(passes)))
-    noise = 3 * rays.sigma
+    margin = 3 * rays.sigma
     was_free = observed & (passes > 0)
-    free = was_free & ((sdf > _NOVEL_VOXELS * size + noise) | near_new)
+    free = was_free & ((sdf > _NOVEL_VOXELS * size + margin) | near_new)
     # Space that a new thing has hidden: it has moved there, or this is another side of it.
     novel = ends & empty & (free | ((passes < 0) & near_new))
-    beside_new = ends & empty & was_free & (sdf > _BESIDE_VOXELS * size + noise)
+    may_join = ends & empty & was_free & (sdf > _JOINS_VOXELS * size + margin)
 
     # New things move on: returns near them are expected, and say nothing about the whole cloud.
     compared = Compared(observed & ~near_new, novel, jnp.abs(sdf))
     verdict = judge(config, grid, rays, updates, compared)
-    return Novelty(novel, beside_new, ends & near_new, verdict.consistent, verdict.noise)
+    return Novelty(novel, may_join, ends & near_new, verdict.consistent, verdict.noise)

@@ -87,8 +87,9 @@ def drop_vanished(
     """Removes patches that several scans have looked through since a ray last ended on them.
 
     A patch on a new surface is removed by one scan that looks half a voxel past it: it may have
-    moved on. The remains of a thing are removed when enough voxels around them have vanished, and
-    fewer suffice where a whole thing has left.
+    moved on. A part so thin that most rays miss it becomes old instead, unless a ray of the scan
+    should have ended on it. The remains of a thing are removed when enough voxels around them have
+    vanished, and fewer suffice where a whole thing has left.
 
     Args:
         config: The map's configuration.
@@ -122,14 +123,17 @@ def drop_vanished(
     old = change.ravel()[row].astype(jnp.int32)
     crossed, met, looked_past = _look(config, window, rays, view, row)
     hits = window.hits.ravel()[row]
-    doubt = jnp.where(old > 0, 0, -old) + crossed
-    needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
     passes = jnp.abs(window.passes.ravel()[row])
     new_passes = passes - jnp.abs(before.passes.ravel()[row])
+    # By the share of all rays that did, at least one of the cloud's should have ended here.
     missed = new_passes * hits >= hits + passes
     moved_on = (old > 0) & looked_past & (missed | (hits >= passes))
+    # One scan says little of a part so thin that most rays miss it. From now on it is old.
+    is_new = (old > 0) & (moved_on | ~looked_past)
+    doubt = crossed - jnp.minimum(old, 0)
+    needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
     vanished = ((crossed > 0) & (doubt >= needed)) | moved_on
-    counted = jnp.where(old > 0, old, -jnp.minimum(doubt, -_FORGOTTEN))
+    counted = jnp.where(is_new, old, -jnp.minimum(doubt, -_FORGOTTEN))
 
     def put(array: jax.Array, values: jax.Array) -> jax.Array:
         values = jnp.broadcast_to(values, voxel.shape).astype(array.dtype)
