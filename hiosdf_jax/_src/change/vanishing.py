@@ -35,6 +35,11 @@ _LEAST_COSINE = 0.2
 # A new surface may move by less than a voxel. Rays that go this much farther are past it, voxels.
 _PAST_NEW_VOXELS = 0.5
 
+# A new surface is a thin part with at least this many passes per hit, and this share of the rays that
+# a voxel can remember. Boxes that have stood for fewer rays are gone one scan sooner.
+_THIN_PASSES = 2.0
+_THIN_SHARE = 0.5
+
 # A scan adds doubt by the quarters of a patch that its rays cross: 3 for four quarters, 2 for
 # three, 1 for two. Two quarters add 2 if several rays cross them, such as a ring of a LiDAR.
 # `vanish_scans` counts scans that add this much.
@@ -127,8 +132,10 @@ def drop_vanished(
     new_passes = passes - jnp.abs(before.passes.ravel()[row])
     # By the share of all rays that did, at least one of the cloud's should have ended here.
     missed = new_passes * hits >= hits + passes
-    moved_on = (old > 0) & looked_past & (missed | (hits >= passes))
-    # One scan says little of a part so thin that most rays miss it. From now on it is old.
+    # One scan says little of a part that stands among many rays and is so thin that most miss it.
+    # From now on it is old.
+    thin = (passes >= _THIN_PASSES * hits) & (hits + passes >= _THIN_SHARE * config.evidence_limit)
+    moved_on = (old > 0) & looked_past & (missed | ~thin)
     is_new = (old > 0) & (moved_on | ~looked_past)
     doubt = crossed - jnp.minimum(old, 0)
     needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
