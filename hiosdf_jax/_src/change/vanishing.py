@@ -35,8 +35,8 @@ _LEAST_COSINE = 0.2
 # A new surface may move by less than a voxel. Rays that go this much farther are past it, voxels.
 _PAST_NEW_VOXELS = 0.5
 
-# A new surface is a thin part with at least this many passes per hit, and this share of the rays that
-# a voxel can remember. Boxes that have stood for fewer rays are gone one scan sooner.
+# A new surface is a thin part with at least this many passes per hit, and this share of the rays
+# that a voxel can remember. Boxes that have stood for fewer rays are gone one scan sooner.
 _THIN_PASSES = 2.0
 _THIN_SHARE = 0.5
 
