@@ -155,7 +155,37 @@ def test_hidden_voxels_are_shown_again_when_rays_pass_them(hidden):
     np.testing.assert_array_equal(result[deep], np.asarray(old.passes)[deep])
 
 
-CELL = (6, 5, 4)  # its center is (0.35, 0.55, 0.65)
+CELL = (6, 5, 4)
+MIDDLE = np.array([0.35, 0.55, 0.65])  # its center
+
+
+def found_in(novel, may_join=False, near_new=False):
+    """What the comparison found of a consistent cloud: masks of its rows, or one value for all."""
+
+    def rows(mask):
+        return jnp.broadcast_to(jnp.asarray(mask, bool), ROWS)
+
+    return Novelty(
+        novel=rows(novel),
+        may_join=rows(may_join),
+        near_new=rows(near_new),
+        consistent=jnp.asarray(True),
+        noise=jnp.asarray(False),
+    )
+
+
+def add_to_free_space(ends, found, change=0):
+    """Fuses returns in space that rays have passed; the window and the mask of fresh rays."""
+    rays, start = rays_of(ends), empty_window()
+    start = start._replace(
+        passes=jnp.full_like(start.passes, 40.0), change=start.change.at[CELL].set(change)
+    )
+    return add_new(CONFIG, start, fuse_hits(CONFIG, start, rays), rays, found)
+
+
+def neighbor(offset):
+    """The voxel at an offset, m, from `CELL`."""
+    return tuple(np.add(CELL, np.round(np.array(offset) / 0.1).astype(int)))
 
 
 def renew(count, near_new=False, novel=True, passes=40.0, hits=0.0, change=0, beside=0):
@@ -167,7 +197,7 @@ def renew(count, near_new=False, novel=True, passes=40.0, hits=0.0, change=0, be
         change=start.change.at[CELL].set(change),
     )
     rng = np.random.default_rng(3)
-    ends = np.array([0.35, 0.55, 0.65]) + rng.uniform(-0.02, 0.02, (count, 3))
+    ends = MIDDLE + rng.uniform(-0.02, 0.02, (count, 3))
     past = np.array([0.85, 0.56, 0.66]) + rng.uniform(-0.02, 0.02, (beside, 3))
     ended = np.arange(ROWS) < count
     rays = rays_of(np.concatenate([ends, past, np.full((1, 3), 0.35)]))
@@ -176,13 +206,7 @@ def renew(count, near_new=False, novel=True, passes=40.0, hits=0.0, change=0, be
     new = float(beside)
     moved = jnp.abs(window.passes[CELL]) + new if beside else window.passes[CELL]
     window = window._replace(passes=window.passes.at[CELL].set(moved))
-    found = Novelty(
-        novel=jnp.asarray(ended & novel),
-        may_join=jnp.asarray(ended),
-        near_new=jnp.asarray(ended & near_new),
-        consistent=jnp.asarray(True),
-        noise=jnp.asarray(False),
-    )
+    found = found_in(ended & novel, may_join=ended, near_new=ended & near_new)
     result, fresh = add_new(CONFIG, start, window, rays, found)
     others = np.ones(SHAPE, bool)
     others[CELL] = False
@@ -231,28 +255,16 @@ def test_returns_in_hidden_space_are_newer_evidence_than_old_passes():
     ("offset", "new"), [((0, 0, 0.1), True), ((-0.1, 0.1, 0), True), ((0, 0.2, 0), False)]
 )
 def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset, new):
-    middle = np.array([0.35, 0.55, 0.65])
-    ends = np.concatenate([middle + np.zeros((3, 3)), middle[None] + offset])
-    rays = rays_of(ends)
-    start = empty_window()
-    start = start._replace(passes=jnp.full_like(start.passes, 40.0))
-    ended = np.asarray(rays.in_range)
-    found = Novelty(
-        novel=jnp.asarray(ended),
-        may_join=jnp.zeros(ROWS, bool),
-        near_new=jnp.zeros(ROWS, bool),
-        consistent=jnp.asarray(True),
-        noise=jnp.asarray(False),
-    )
-    result, fresh = add_new(CONFIG, start, fuse_hits(CONFIG, start, rays), rays, found)
-    other = tuple(np.add(CELL, np.round(np.array(offset) / 0.1).astype(int)))
+    ends = MIDDLE + np.concatenate([np.zeros((3, 3)), [offset]])
+    ended = np.arange(ROWS) < len(ends)
+    result, fresh = add_to_free_space(ends, found_in(ended))
     assert float(result.passes[CELL]) == 0
-    assert float(result.passes[other]) == (0 if new else 40)
+    assert float(result.passes[neighbor(offset)]) == (0 if new else 40)
     assert np.asarray(fresh).sum() == (4 if new else 3)
 
 
 @pytest.mark.parametrize(
-    ("offset", "count", "beside", "hides"),
+    ("offset", "count", "joins", "hides"),
     [
         ((0, 0, -0.1), 3, True, True),
         ((0, 0, -0.1), 1, True, True),
@@ -260,29 +272,16 @@ def test_a_single_novel_return_joins_a_surface_that_the_same_cloud_shows(offset,
         ((0, 0, -0.2), 3, True, False),
     ],
 )
-def test_returns_near_the_floor_hide_space_beside_a_new_surface(offset, count, beside, hides):
-    middle = np.array([0.35, 0.55, 0.65])
-    ends = middle + np.concatenate([np.zeros((3, 3)), np.tile(offset, (count, 1))])
-    rays = rays_of(ends)
-    start = empty_window()
-    start = start._replace(passes=jnp.full_like(start.passes, 40.0))
-    lower = np.arange(ROWS) >= 3
-    ended = np.asarray(rays.in_range)
-    found = Novelty(
-        novel=jnp.asarray(ended & ~lower),
-        may_join=jnp.asarray(ended & (beside | ~lower)),
-        near_new=jnp.zeros(ROWS, bool),
-        consistent=jnp.asarray(True),
-        noise=jnp.asarray(False),
-    )
-    result, fresh = add_new(CONFIG, start, fuse_hits(CONFIG, start, rays), rays, found)
-    other = tuple(np.add(CELL, np.round(np.array(offset) / 0.1).astype(int)))
+def test_returns_near_the_floor_hide_space_beside_a_new_surface(offset, count, joins, hides):
+    ends = MIDDLE + np.concatenate([np.zeros((3, 3)), np.tile(offset, (count, 1))])
+    ended, lower = np.arange(ROWS) < len(ends), np.arange(ROWS) >= 3
+    may_join = ended & (joins | ~lower)
+    result, fresh = add_to_free_space(ends, found_in(ended & ~lower, may_join))
+    other = neighbor(offset)
     assert float(result.passes[CELL]) == 0
     assert float(result.passes[other]) == 40
     assert int(result.change[other]) == 0
     assert np.asarray(fresh).sum() == 3 + hides * count
     # Also while the surface next to it is still new, in a later scan.
-    later = found._replace(novel=jnp.zeros(ROWS, bool))
-    new = start._replace(change=start.change.at[CELL].set(5))
-    _, fresh = add_new(CONFIG, new, fuse_hits(CONFIG, new, rays), rays, later)
+    _, fresh = add_to_free_space(ends, found_in(False, may_join), change=5)
     assert np.asarray(fresh).sum() == 3 + hides * count

@@ -136,11 +136,11 @@ def drop_vanished(
     # From now on it is old.
     thin = (passes >= _THIN_PASSES * hits) & (hits + passes >= _THIN_SHARE * config.evidence_limit)
     moved_on = (old > 0) & looked_past & (missed | ~thin)
-    is_new = (old > 0) & (moved_on | ~looked_past)
+    stays_new = (old > 0) & ~looked_past
     doubt = crossed - jnp.minimum(old, 0)
     needed = _DOUBT_PER_SCAN * jnp.ceil(config.vanish_scans * jnp.minimum(hits / _SURE_HITS, 1))
     vanished = ((crossed > 0) & (doubt >= needed)) | moved_on
-    counted = jnp.where(is_new, old, -jnp.minimum(doubt, -_FORGOTTEN))
+    counted = jnp.where(stays_new, old, -jnp.minimum(doubt, -_FORGOTTEN))
 
     def put(array: jax.Array, values: jax.Array) -> jax.Array:
         values = jnp.broadcast_to(values, voxel.shape).astype(array.dtype)
