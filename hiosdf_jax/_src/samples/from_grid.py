@@ -20,7 +20,7 @@ from hiosdf_jax._src.state.pytrees import NO_FEATURE, Grid, surface_of
 # largest share of all far samples, and their standard deviation from the voxel.
 _PER_CHANGED_VOXEL = 10
 _MOST_CHANGED_SHARE = 0.25
-_CHANGED_SPREAD_M = 0.35
+_CHANGED_SPREAD_M = 0.2
 
 _TILE = 4096  # points whose distances are computed at once on a CPU
 
