@@ -64,14 +64,7 @@ def other_source(monkeypatch):
     return GIVEN
 
 
-def other_backend(monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "another")
-    return GIVEN
-
-
-@pytest.mark.parametrize(
-    "change", [other_shape, other_dtype, other_constant, other_source, other_backend]
-)
+@pytest.mark.parametrize("change", [other_shape, other_dtype, other_constant, other_source])
 def test_a_program_of_other_conditions_is_not_used(folder, monkeypatch, change):
     run()
     given = change(monkeypatch)
@@ -140,6 +133,13 @@ def test_where_programs_cannot_be_stored_they_are_traced(
     assert traces == 1
     assert arrays_equal(result, example(GIVEN))
     assert not list(tmp_path.rglob("*.stablehlo"))
+
+
+def test_a_gpu_stores_nothing(folder, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    _, traces = run()
+    assert traces == 1
+    assert not files(folder)
 
 
 def test_an_update_by_a_stored_program_equals_a_traced_one(empty_map, room_map):

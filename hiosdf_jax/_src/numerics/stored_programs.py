@@ -25,7 +25,6 @@ from hiosdf_jax._src.output_files import replacing
 
 _PACKAGE = __name__.split(".")[0]
 _LIBRARIES = ("jax", "jaxlib", "optax", "flax", "numpy")
-_OUR_KERNELS = jax.export.DisabledSafetyCheck.custom_call("mosaic_gpu_v2")
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _FOLDER = "jax_compilation_cache_dir"
 
@@ -34,7 +33,8 @@ def stored[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Makes a function that is not traced where an earlier process has traced it.
 
     It is for the outermost `jax.jit` alone: a stored program has no derivatives and no batching
-    rule, and runs on one device. Without a persistent cache the function is traced as usual.
+    rule, and runs on one device. Without a persistent cache, and on a GPU, the function is traced
+    as usual: a process that has not traced our kernels lacks what they need to run.
 
     A program is used only where the source files of this package, the versions of its libraries,
     JAX's settings, the kind of device and the types of the arguments are those of the process that
@@ -73,10 +73,15 @@ def is_on_default_device(array: jax.Array) -> bool:
 def _folder() -> Path | None:
     """Returns the folder of the persistent cache, or None where programs cannot be stored."""
     folder = getattr(jax.config, _FOLDER)
-    usable = folder and "://" not in folder and jax.config.jax_enable_compilation_cache
-    if not usable or jax.config.jax_disable_jit or not jax.sharding.get_abstract_mesh().empty:
-        return None
-    return Path(folder)
+    usable = (
+        folder
+        and "://" not in folder
+        and jax.config.jax_enable_compilation_cache
+        and not jax.config.jax_disable_jit
+        and jax.default_backend() == "cpu"
+        and jax.sharding.get_abstract_mesh().empty
+    )
+    return Path(folder) if usable else None
 
 
 def _type_of(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -98,7 +103,7 @@ def _write(path: Path, function: Callable, types: Any) -> jax.export.Exported:
     """Traces a function and stores its program, if the folder can be written."""
     # JAX would reuse what it has traced of the same function object, with the old constants.
     fresh = jax.jit(functools.partial(function))
-    program = jax.export.export(fresh, disabled_checks=[_OUR_KERNELS])(*types)
+    program = jax.export.export(fresh)(*types)
     content = bytes(program.serialize())
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
