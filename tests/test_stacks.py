@@ -19,6 +19,7 @@ What has failed in users' stacks, and the test of it. Those without a file are i
 - jax.export, symbolic batch, AOT
     test_export_with_an_open_number_of_points
     test_export_of_a_whole_map_and_of_named_results
+    test_an_exported_update_maps_what_update_maps
     test_lowered_and_compiled_ahead_of_time
 - rank and dtype promotion, transfer guard
     test_strict_promotion
@@ -73,7 +74,7 @@ import numpy as np
 import pytest
 from flax import serialization
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
-from room import arrays_equal, stream
+from room import CONFIG, arrays_equal, room_cloud, stream
 
 import hiosdf_jax as hio
 from hiosdf_jax import exports, planning
@@ -203,6 +204,15 @@ def test_export_of_a_whole_map_and_of_named_results(room_map, fields):
     assert isinstance(answer, hio.Query)
 
 
+def test_an_exported_update_maps_what_update_maps(room_map):
+    pytest.importorskip("flatbuffers", reason="jax.export writes with it")
+    cloud, pose = room_cloud(5)
+    cloud, pose = hio.pad_cloud(CONFIG, cloud, pose), np.asarray(pose, np.float32)
+    written = jax.export.export(jax.jit(hio.update))(room_map, cloud, pose).serialize()
+    update = jax.jit(jax.export.deserialize(bytearray(written)).call)
+    assert arrays_equal(update(room_map, cloud, pose), hio.update(room_map, cloud, pose))
+
+
 def test_lowered_and_compiled_ahead_of_time(fields):
     compiled = jax.jit(obstacle).lower(fields["baked"], POINTS).compile()
     np.testing.assert_allclose(
@@ -295,6 +305,8 @@ def test_flax_writes_and_reads_a_map(room_map, empty_map):
     read = serialization.from_bytes(empty_map, serialization.to_bytes(room_map))
     assert arrays_equal(read, room_map)
     assert jax.random.key_impl(read.key) == jax.random.key_impl(room_map.key)
+    frame = room_cloud(5)  # its leaves are numpy's
+    assert arrays_equal(hio.update(read, *frame), hio.update(room_map, *frame))
 
 
 def test_ravel_takes_the_float_leaves(fields):

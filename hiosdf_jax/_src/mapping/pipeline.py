@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -31,7 +30,6 @@ from hiosdf_jax._src.numerics.intake import (
 )
 from hiosdf_jax._src.numerics.modes import cond, plain
 from hiosdf_jax._src.numerics.robot_and_noise import check_extras
-from hiosdf_jax._src.numerics.stored_programs import is_on_default_device, stored
 from hiosdf_jax._src.state.checks import check_map
 from hiosdf_jax._src.state.pytrees import MapState
 
@@ -119,8 +117,7 @@ def run_update(
 ) -> MapState:
     """Runs the compiled update, the same one for `update` and for tracking.
 
-    Inside jit it is a nested call of the same compiled function, traced once per shape. Outside,
-    the program may be one that an earlier process has traced.
+    Inside jit it is a nested call of the same compiled function, traced once per shape.
 
     Args:
         state: The map so far.
@@ -133,14 +130,9 @@ def run_update(
     Returns:
         The new map.
     """
-    arguments = (state, cloud, pose, *extras, flags_so_far)
-    traced = is_traced(*jax.tree.leaves(arguments))
-    if not traced and is_on_default_device(state.grid.evidence.hits):
-        compiled = _update_donating if donate else _update_jit
-    else:
-        compiled = _nested_donating if donate else _nested_jit
+    compiled = _update_donating if donate else _update_jit
     with collector_paused():
-        return compiled(*arguments)
+        return compiled(state, cloud, pose, *extras, flags_so_far)
 
 
 def pad_cloud(config: Config, cloud: Any, pose: Any = None) -> np.ndarray:
@@ -370,11 +362,6 @@ def _update(
     )
 
 
-def _jit(function: Callable, donate: bool) -> Callable:
-    # Also leaves that an update does not read are donated.
-    return jax.jit(function, donate_argnums=(0,) if donate else (), keep_unused=donate)
-
-
-_update_jit, _update_donating = (_jit(stored(_update), donate) for donate in (False, True))
-# Inside other functions, and on devices that the caller chose.
-_nested_jit, _nested_donating = (_jit(_update, donate) for donate in (False, True))
+_update_jit = jax.jit(_update)
+# Also leaves that an update does not read are donated.
+_update_donating = jax.jit(_update, donate_argnums=0, keep_unused=True)
