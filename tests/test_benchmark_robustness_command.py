@@ -158,6 +158,9 @@ def test_the_gate_finds_what_got_worse(tmp_path):
     loaded = records.read(path)
     assert loaded["light"]["rows"] == old | {"more": {"solid": [1.0]}}
     assert set(loaded) == {"light", "default"}
+    gate.update_means(path, "light", record | {"rows": {"row": {"solid": [0.9, 1.0]}}})
+    loaded = records.read(path)["light"]
+    assert loaded["rows"] == {"row": {"solid": 0.95}, "more": {"solid": [1.0]}}
 
 
 def test_a_baseline_without_a_number_is_worse_than_any(tmp_path):
@@ -172,8 +175,9 @@ def test_the_command_runs_a_scenario_and_compares(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(command, "scenarios", lambda data: {"appear": lambda setup: rows})
     baseline, output = tmp_path / "baseline.json", tmp_path / "run.json"
     arguments = ["--baseline", str(baseline), "--output", str(output), "--seeds", "0", "1"]
-    assert command.main([*arguments, "--update-baseline"]) == 0
-    for path in (output, baseline):
+    monkeypatch.setattr(command, "_TABLES", tmp_path / "tables.json")
+    assert command.main([*arguments, "--update-baseline", "--update-tables"]) == 0
+    for path in (output, baseline, tmp_path / "tables.json"):
         assert records.provenance().items() <= records.read(path)["light"].items()
     assert records.read(output)["light"]["rows"] == {
         "appears after 1, camera": {"solid": [0.2, 0.2], "side_cm": [1.0, 1.0]}

@@ -9,7 +9,7 @@ import pytest
 from benchmarks import records
 from benchmarks.accuracy import results
 from benchmarks.tables import __main__ as command
-from benchmarks.tables import accuracy, markdown, registration, speed
+from benchmarks.tables import accuracy, markdown, registration, robustness, speed
 
 RECORDS = sorted(records.RESULTS.glob("*.json"))
 
@@ -108,6 +108,16 @@ def _leaves(value, keys):
             yield from _leaves(item, keys)
     elif isinstance(value, float):
         yield keys, value
+
+
+def test_tables_of_robustness_name_every_bar_that_is_missed():
+    record = json.loads((records.RESULTS / "robustness.json").read_text())["default"]["rows"]
+    bars, missed = robustness.bars().splitlines(), robustness.missed().splitlines()
+    met, all_bars = map(int, bars[2].split(" | ")[-1].strip(" |").split(" of "))
+    assert 0 < met < all_bars
+    late = [line for line in missed if line.startswith("| appears after 1, lidar | `slack_cm`")]
+    assert late and f"{record['appears after 1, lidar']['slack_cm']:.3g} | at most 6 |" in late[0]
+    assert len(missed) - 2 >= all_bars - met  # those of Config.light may be others
 
 
 def test_records_are_small():

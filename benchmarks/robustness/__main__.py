@@ -16,6 +16,8 @@ from benchmarks.robustness.measures import Figures
 
 Scenario = Callable[[Setup], dict[str, Figures]]
 
+_TABLES = records.RESULTS / "robustness.json"
+
 
 def scenarios(data: Path) -> dict[str, Scenario]:
     """All scenarios by name.
@@ -70,6 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for each in missed:
             print(f"  MISSED {each.row}: {each.bar.figure} {each.value:.3g}", end="")
             print(f", expected {each.bar.least:.3g} to {each.bar.most:.3g}")
+    if options.update_tables:
+        gate.update_means(_TABLES, options.config, record)
+        print(f"wrote {_TABLES}")
     if options.update_baseline:
         gate.update_baseline(options.baseline, options.config, record)
         print(f"wrote {options.baseline}")
@@ -108,6 +113,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--baseline", type=Path, default=gate.BASELINE, metavar="FILE")
     parser.add_argument(
         "--update-baseline", action="store_true", help="write the figures into the baseline"
+    )
+    parser.add_argument(
+        "--update-tables",
+        action="store_true",
+        help="write the figures that the documents show into their record",
     )
     parser.add_argument(
         "--output",

@@ -56,6 +56,24 @@ def update_baseline(path: Path, config_name: str, record: dict[str, Any]) -> Non
     records.write(path, baseline)
 
 
+def update_means(path: Path, config_name: str, record: dict[str, Any]) -> None:
+    """Writes the means of a run over its seeds into a record; rows that were not run stay.
+
+    Args:
+        path: The file.
+        config_name: Name of the configuration.
+        record: {"device", "jax", "revision", "seeds", "rows"}.
+    """
+    written = records.read(path)
+    means = {
+        row: {name: records.rounded(float(np.mean(values)), 4) for name, values in each.items()}
+        for row, each in record["rows"].items()
+    }
+    rows = written.get(config_name, {}).get("rows", {}) | means
+    written[config_name] = record | {"rows": rows}
+    records.write(path, written)
+
+
 def compare(old: Results, new: Results) -> Verdict:
     """Compares results with those of a baseline.
 

@@ -3,7 +3,7 @@
 python -m benchmarks.tables            # rewrites the tables
 python -m benchmarks.tables --check    # exit code 1 if a table differs from its record
 
-- `accuracy`, `speed`, `planning` and `registration` render the tables of these records,
-  `provenance` that of where they come from;
+- `accuracy`, `robustness`, `speed`, `planning` and `registration` render the tables of their
+  records, `provenance` that of where they come from;
 - `markdown` lays them out, and replaces them in a document.
 """

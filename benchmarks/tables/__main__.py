@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import records
-from benchmarks.tables import accuracy, planning, provenance, registration, speed
+from benchmarks.tables import accuracy, planning, provenance, registration, robustness, speed
 from benchmarks.tables.markdown import Tables, render
 
 TABLES: Tables = {
@@ -16,6 +16,7 @@ TABLES: Tables = {
     **speed.TABLES,
     **planning.TABLES,
     **registration.TABLES,
+    **robustness.TABLES,
     **provenance.TABLES,
 }
 
