@@ -17,7 +17,7 @@ from room import CONFIG, HALF
 import hiosdf_jax as hio
 from benchmarks import records
 from benchmarks.accuracy import __main__ as command
-from benchmarks.accuracy import figure, gate, measure, results, sources
+from benchmarks.accuracy import figure, gate, gradient_parts, measure, results, sources
 from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.grid.lookup import grid_sdf
@@ -412,3 +412,26 @@ assert sources._with_mesh(Path(__main__.__file__), stream, truth, 9.0) == (truth
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "thin parts and meshes are not scored: trimesh" in done.stdout
+
+
+def test_the_error_of_the_gradient_is_split_by_its_first_reason(monkeypatch):
+    # A floor at z = 0 in the middle of a voxel, seen from above; and a lonely patch of two hits.
+    config = hio.Config.light(((0, 0, 0), (1, 1, 1)), voxel_size=0.1)
+    state = hio.init(config, jax.random.key(0))
+    evidence = jax.tree.map(np.array, state.grid.evidence)
+    evidence.hits[2:8, 2:8, 5] = 20
+    evidence.axes[2:8, 2:8, 5] = 0.29 * np.diag([1, 1, 0.05])
+    evidence.hits[2, 2, 5] = 2
+    state = state.replace(grid=state.grid.replace(evidence=evidence))
+    corner = np.asarray(config.corner_index) * config.voxel_size
+    heights = [0.57, 0.57, 0.57, 0.53]
+    points = corner + np.c_[[0.55, 0.25, 0.83, 0.45], [0.55, 0.25, 0.55, 0.45], heights]
+    up = np.array([[0.0, 0.0, 1.0]] * 4)
+    given = up.copy()
+    given[3] *= -1
+    monkeypatch.setattr(hio, "sdf_and_grad", lambda state, points: (points[:, 2], given))
+    parts = gradient_parts.split_error(state, points, up, lambda at: at[:, 2] - corner[2] - 0.55)
+    assert [part.share for part in parts.values()] == [0.25, 0, 0.25, 0.25, 0.25]
+    assert [part.mean for part in parts.values()] == [2, 0, 0, 0, 0]
+    bent = gradient_parts.split_error(state, points, up, lambda at: np.abs(at).max(axis=1))
+    assert bent["the true gradient turns within 1.5 cm"].share > 0

@@ -67,7 +67,7 @@ def split_error(
     cosine = np.sum(given * exact, axis=1) / np.maximum(lengths, 1e-9)
     hits, off = _nearest_patches(state, points_world)
     reasons = {
-        "the sign is wrong": cosine < 0,
+        "it points the other way: cos < 0": cosine < 0,
         "the true gradient turns within 1.5 cm": _turns(points_world, exact, distance),
         "the nearest patch has fewer than 5 hits": hits < _FEW_HITS,
         "the nearest patch ends before the point": off > _BESIDE_VOXELS,
@@ -147,7 +147,10 @@ def main() -> None:
         f"all {len(points):,} points: {sum(part.share * part.mean for part in parts.values()):.4f}"
     )
     if options.output:
-        found: dict[str, Any] = {reason: part._asdict() for reason, part in parts.items()}
+        found: dict[str, Any] = {
+            reason: {name: records.rounded(value, 4) for name, value in part._asdict().items()}
+            for reason, part in parts.items()
+        }
         record = records.read(options.output)
         records.write(options.output, record | {"now": records.provenance() | {"parts": found}})
 

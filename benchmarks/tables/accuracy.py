@@ -139,6 +139,24 @@ def steps() -> str:
     return lay_out(["of a million segments", *columns], rows)
 
 
+def gradient_parts() -> str:
+    """What the error of the gradient near surfaces is made of, before and now."""
+    record = records.read(records.RESULTS / "gradient_parts.json")
+    both = [record[when]["parts"] for when in ("before", "now")]
+    rows = [
+        [
+            reason,
+            *(f"{100 * parts[reason]['share']:.1f} %" for parts in both),
+            *(f"{parts[reason]['share'] * parts[reason]['mean']:.3f}" for parts in both),
+        ]
+        for reason in both[0]
+    ]
+    sums = [sum(part["share"] * part["mean"] for part in parts.values()) for parts in both]
+    rows.append(["all", "100 %", "100 %", *(f"{total:.3f}" for total in sums)])
+    columns = ["points, before", "now", "part of the mean error, before", "now"]
+    return lay_out(["first reason that holds", *columns], rows)
+
+
 def training() -> str:
     """The paper's network alone, with the paper's samples and epochs."""
     rows = []
@@ -160,6 +178,7 @@ TABLES = {
     "ablation": ablation,
     "mesh": mesh,
     "steps": steps,
+    "gradient-parts": gradient_parts,
     "training": training,
 }
 
