@@ -23,8 +23,6 @@ from benchmarks import records
 from benchmarks.accuracy.sources import open_source
 from hiosdf_jax._src.grid.patches import EXTENT_DEVIATIONS
 
-RECORD = records.RESULTS / "gradient_parts.json"
-
 _NEAR_M = 0.05
 _FEW_HITS = 5
 _BESIDE_VOXELS = 0.02  # off the rectangle of a patch
@@ -47,6 +45,11 @@ class Part(NamedTuple):
     share: float
     mean: float
 
+    @property
+    def error(self) -> float:
+        """The part of the mean error of all points."""
+        return self.share * self.mean
+
 
 def split_error(
     state: hio.MapState, points_world: np.ndarray, exact: np.ndarray, distance: Distance
@@ -60,7 +63,7 @@ def split_error(
         distance: Maps points (n, 3) m to exact distances, (n,) m.
 
     Returns:
-        {reason: its points}. The mean error is the sum of share times mean.
+        {reason: its points}. The mean error is the sum of their `error`.
     """
     given = np.asarray(hio.sdf_and_grad(state, points_world.astype(np.float32))[1], float)
     lengths = np.linalg.norm(given, axis=1) * np.linalg.norm(exact, axis=1)
@@ -128,7 +131,7 @@ def main() -> None:
     """Runs the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.gradient_parts")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    parser.add_argument("--output", type=Path, metavar="FILE", help=f"for example {RECORD.name}")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="write a record")
     options = parser.parse_args()
     source = open_source(options.data, "house_depth")
     if source.truth is None or source.distance is None:
@@ -142,10 +145,8 @@ def main() -> None:
     parts = split_error(state, points, source.truth.grad[near], source.distance)
     for reason, part in parts.items():
         print(f"{reason:42}{part.share:8.1%} of the points, mean error {part.mean:.3f}, ", end="")
-        print(f"together {part.share * part.mean:.4f}")
-    print(
-        f"all {len(points):,} points: {sum(part.share * part.mean for part in parts.values()):.4f}"
-    )
+        print(f"together {part.error:.4f}")
+    print(f"all {len(points):,} points: {sum(part.error for part in parts.values()):.4f}")
     if options.output:
         found: dict[str, Any] = {
             reason: {name: records.rounded(value, 4) for name, value in part._asdict().items()}

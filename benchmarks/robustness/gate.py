@@ -7,6 +7,7 @@ a share.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,16 +45,7 @@ def update_baseline(path: Path, config_name: str, record: dict[str, Any]) -> Non
         config_name: Name of the configuration.
         record: {"device", "jax", "revision", "seeds", "rows"}.
     """
-    baseline = records.read(path)
-    measured = {
-        row: {
-            name: [records.rounded(value, 4) for value in values] for name, values in each.items()
-        }
-        for row, each in record["rows"].items()
-    }
-    rows = baseline.get(config_name, {}).get("rows", {}) | measured
-    baseline[config_name] = record | {"rows": rows}
-    records.write(path, baseline)
+    _update(path, config_name, record, lambda each: [records.rounded(one, 4) for one in each])
 
 
 def update_means(path: Path, config_name: str, record: dict[str, Any]) -> None:
@@ -64,14 +56,7 @@ def update_means(path: Path, config_name: str, record: dict[str, Any]) -> None:
         config_name: Name of the configuration.
         record: {"device", "jax", "revision", "seeds", "rows"}.
     """
-    written = records.read(path)
-    means = {
-        row: {name: records.rounded(float(np.mean(values)), 4) for name, values in each.items()}
-        for row, each in record["rows"].items()
-    }
-    rows = written.get(config_name, {}).get("rows", {}) | means
-    written[config_name] = record | {"rows": rows}
-    records.write(path, written)
+    _update(path, config_name, record, lambda each: records.rounded(float(np.mean(each)), 4))
 
 
 def compare(old: Results, new: Results) -> Verdict:
@@ -97,6 +82,20 @@ def compare(old: Results, new: Results) -> Verdict:
             elif change < -_tolerance(name, before, after):
                 verdict.better.append(line)
     return verdict
+
+
+def _update(
+    path: Path, config_name: str, record: dict[str, Any], kept: Callable[[list[float]], Any]
+) -> None:
+    """Writes of each figure what `kept` makes of its values by seed."""
+    written = records.read(path)
+    measured = {
+        row: {name: kept(values) for name, values in each.items()}
+        for row, each in record["rows"].items()
+    }
+    rows = written.get(config_name, {}).get("rows", {}) | measured
+    written[config_name] = record | {"rows": rows}
+    records.write(path, written)
 
 
 def _worsening(name: str, old: np.ndarray, new: np.ndarray) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks import records
+from benchmarks.accuracy.gradient_parts import Part
 from benchmarks.accuracy.results import load_peers
 from benchmarks.tables.markdown import lay_out
 from hiosdf_jax.scoring import format_score
@@ -142,16 +143,19 @@ def steps() -> str:
 def gradient_parts() -> str:
     """What the error of the gradient near surfaces is made of, before and now."""
     record = records.read(records.RESULTS / "gradient_parts.json")
-    both = [record[when]["parts"] for when in ("before", "now")]
+    both = [
+        {reason: Part(**part) for reason, part in record[when]["parts"].items()}
+        for when in ("before", "now")
+    ]
     rows = [
         [
             reason,
-            *(f"{100 * parts[reason]['share']:.1f} %" for parts in both),
-            *(f"{parts[reason]['share'] * parts[reason]['mean']:.3f}" for parts in both),
+            *(f"{100 * parts[reason].share:.1f} %" for parts in both),
+            *(f"{parts[reason].error:.3f}" for parts in both),
         ]
         for reason in both[0]
     ]
-    sums = [sum(part["share"] * part["mean"] for part in parts.values()) for parts in both]
+    sums = [sum(part.error for part in parts.values()) for parts in both]
     rows.append(["all", "100 %", "100 %", *(f"{total:.3f}" for total in sums)])
     columns = ["points, before", "now", "part of the mean error, before", "now"]
     return lay_out(["first reason that holds", *columns], rows)
