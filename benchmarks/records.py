@@ -17,6 +17,8 @@ from hiosdf_jax._src.output_files import replacing
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 
+_WIDTH = 100  # characters of a line, unless an innermost list or object has more
+
 
 def provenance() -> dict[str, str]:
     """Names what a run is measured on.
@@ -49,7 +51,7 @@ def read(path: Path) -> Any:
 
 
 def write(path: Path, value: Any) -> None:
-    """Writes a record with each innermost list or object on one line.
+    """Writes a record with each innermost list or object on one line, short ones side by side.
 
     Args:
         path: The file; its folder is made if it is not there.
@@ -89,10 +91,13 @@ def _lay_out(value: Any, indent: str) -> str:
     pairs = value.items() if isinstance(value, dict) else [("", item) for item in value]
     if not any(isinstance(item, dict | list) for _, item in pairs):
         return json.dumps(value)
-    deeper = indent + " "
-    lines = []
+    deeper, lines = indent + " ", []
     for key, item in pairs:
         text = _lay_out(item, deeper) if isinstance(item, dict | list) else json.dumps(item)
-        lines.append(deeper + (f"{json.dumps(key)}: " if isinstance(value, dict) else "") + text)
+        text = f"{json.dumps(key)}: {text}" if isinstance(value, dict) else text
+        if lines and len(lines[-1]) + len(text) + 3 <= _WIDTH and "\n" not in lines[-1] + text:
+            lines[-1] += f", {text}"
+        else:
+            lines.append(deeper + text)
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     return "\n".join([opening, ",\n".join(lines), indent + closing])
