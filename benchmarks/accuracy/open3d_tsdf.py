@@ -12,7 +12,10 @@ import open3d  # pyright: ignore[reportMissingImports]
 
 _DEVICE = open3d.core.Device("CPU:0")
 _BLOCK = 16  # voxels along each side of a block
-_LEAST_WEIGHT = 3.0  # observations of a voxel that the mesh needs, Open3D's default
+
+# Open3D rounds projected pixel coordinates down, so it expects the center of the first pixel at
+# (0.5, 0.5). The streams have it at (0, 0).
+_PIXEL_CENTER = 0.5
 
 
 def main() -> None:
@@ -22,10 +25,21 @@ def main() -> None:
     parser.add_argument("mesh", help="the mesh to write, .ply")
     parser.add_argument("--voxel", type=float, default=0.02, help="m (default: %(default)s)")
     parser.add_argument("--range", type=float, default=9.0, help="m (default: %(default)s)")
+    parser.add_argument(
+        "--truncation", type=float, default=4.0, help="voxels (default: %(default)s; Open3D's: 8)"
+    )
+    parser.add_argument(
+        "--least-weight",
+        type=float,
+        default=1.0,
+        help="observations of a voxel that the mesh needs (default: %(default)s; Open3D's: 3)",
+    )
     options = parser.parse_args()
 
     arrays = np.load(options.stream)
-    intrinsics = open3d.core.Tensor(arrays["K"].astype(float))
+    matrix = arrays["K"].astype(float)
+    matrix[:2, 2] += _PIXEL_CENTER
+    intrinsics = open3d.core.Tensor(matrix)
     units_per_m = float(arrays["depth_scale"])
     grid = open3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"),
@@ -41,9 +55,10 @@ def main() -> None:
         image = open3d.t.geometry.Image(open3d.core.Tensor(np.ascontiguousarray(depth)))
         extrinsics = open3d.core.Tensor(np.linalg.inv(pose.astype(float)))
         view = (image, intrinsics, extrinsics, units_per_m, options.range)
-        grid.integrate(grid.compute_unique_block_coordinates(*view), *view)
+        blocks = grid.compute_unique_block_coordinates(*view, options.truncation)
+        grid.integrate(blocks, *view, options.truncation)
     frame_ms = 1e3 * (time.perf_counter() - start) / len(arrays["poses"])
-    mesh = grid.extract_triangle_mesh(_LEAST_WEIGHT).to_legacy()
+    mesh = grid.extract_triangle_mesh(options.least_weight).to_legacy()
     open3d.io.write_triangle_mesh(options.mesh, mesh)
     print(f"wrote {options.mesh}: {len(mesh.triangles)} triangles, {frame_ms:.1f} ms per frame")
 
