@@ -78,9 +78,12 @@ def test_the_visible_side_is_scored_by_its_error(made):
 
 def test_an_old_place_must_reach_its_true_distance(made):
     rng = np.random.default_rng(0)
-    scores = measures.old_place(Made(EMPTY.distance), EMPTY, [BOX], rng, 0.35)
+    place = measures.draw_old_place(EMPTY, [BOX], rng, 0.35)
+    scores = measures.old_place(Made(EMPTY.distance), *place)
     assert scores == {"old": 1.0, "old_lower": 1.0, "old_network": 1.0}
-    still_there = measures.old_place(Made(FULL.distance), EMPTY, [BOX], rng)
+    still_there = measures.old_place(
+        Made(FULL.distance), *measures.draw_old_place(EMPTY, [BOX], rng)
+    )
     assert max(still_there.values()) < 0.02
 
 

@@ -67,16 +67,16 @@ def visit(setup: Setup) -> Rows:
     state = library.play(state, frames[:chair_seen], "apartment: chair").state
     world = world_at(apartment, chair_seen)
     chair = range(1, 1 + len(chair_at(_CHAIR_AFTER)))
-    rows["apartment: chair moved"] = measures.old_place(
-        state, world, chair_at(_CHAIR_BEFORE), setup.rng(1), _LEAST_TRUTH
-    ) | measures.visible_side(state, seen[_CHAIR_MOVES:chair_seen], chair)
+    place = measures.draw_old_place(world, chair_at(_CHAIR_BEFORE), setup.rng(1), _LEAST_TRUTH)
+    rows["apartment: chair moved"] = measures.old_place(state, *place) | measures.visible_side(
+        state, seen[_CHAIR_MOVES:chair_seen], chair
+    )
 
     door_seen = _DOOR_OPENS.stop + _SCANS_AFTER
     state = library.play(state, frames[chair_seen:door_seen], "apartment: door").state
     world = world_at(apartment, door_seen)
-    rows["apartment: door opens"] = measures.old_place(
-        state, world, [door_at(0)], setup.rng(1), _LEAST_TRUTH
-    )
+    place = measures.draw_old_place(world, [door_at(0)], setup.rng(1), _LEAST_TRUTH)
+    rows["apartment: door opens"] = measures.old_place(state, *place)
 
     state = library.play(state, frames[door_seen : _WALK.start], "apartment: door").state
     people = [person_at(k) for k in _WALK]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from benchmarks.robustness import library, measures
 from benchmarks.robustness.library import Setup
 from benchmarks.robustness.scenes import ROOM, frames_of, new_map, scan_all
-from benchmarks.robustness.sensors import SENSORS
+from benchmarks.robustness.sensors import SENSORS, Scan, Sensor
 from benchmarks.robustness.worlds import Box, World
 
 Rows = dict[str, measures.Figures]
@@ -17,8 +21,8 @@ _NETWORK_SCANS_AFTER = 10
 _HALF = (0.25, 0.3, 0.6)
 _STANDING = Box((3.8, 2.5, 0.6), _HALF)
 # A box that hangs: all of the place that it leaves is far from any surface.
-_HANGING = Box((3.8, 1.8, 1.3), _HALF)
-_JUMPED = Box((3.8, 3.2, 1.3), _HALF)
+HANGING = Box((3.8, 1.8, 1.3), _HALF)
+JUMPED = Box((3.8, 3.2, 1.3), _HALF)
 
 
 def appear(setup: Setup) -> Rows:
@@ -63,29 +67,33 @@ def stand(setup: Setup) -> Rows:
 def jump(setup: Setup) -> Rows:
     """A box is seen for 12 scans, and then 1.4 m beside."""
     rows = {}
-    world = World(ROOM, (_JUMPED,))
+    world = World(ROOM, (JUMPED,))
     for sensor in (make() for make in SENSORS.values()):
         name = f"jumps, {sensor.name}"
-        before = scan_all(setup, sensor, lambda _: World(ROOM, (_HANGING,)), range(12))
+        before = scan_all(setup, sensor, lambda _: World(ROOM, (HANGING,)), range(12))
         state = library.play(new_map(setup), frames_of(before), f"{name}: before").state
         after = scan_all(setup, sensor, lambda _: world, range(12, 12 + _NETWORK_SCANS_AFTER))
         early = library.play(state, frames_of(after[:SCANS_AFTER]), name).state
         late = library.play(early, frames_of(after[SCANS_AFTER:]), name).state
         rng = setup.rng(1)
         figures = (
-            measures.old_place(
-                early, world, [_HANGING], rng, sensor=sensor, scans=after[:SCANS_AFTER]
-            )
+            measures.old_place(early, *_place_left(world, rng, sensor, after[:SCANS_AFTER]))
             | measures.visible_side(early, after[:SCANS_AFTER], [0])
-            | measures.solidity(early, _JUMPED, rng)
+            | measures.solidity(early, JUMPED, rng)
             | measures.bounds_hold(
                 early, *measures.seen_points(sensor, after[:SCANS_AFTER], world, rng)
             )
         )
         # The network has twice the scans.
-        figures["old_network"] = measures.old_place(
-            late, world, [_HANGING], rng, sensor=sensor, scans=after
-        )["old_network"]
+        place = _place_left(world, rng, sensor, after)
+        figures["old_network"] = measures.old_place(late, *place)["old_network"]
         figures["side_network_cm"] = measures.visible_side(late, after, [0])["side_network_cm"]
         rows[name] = figures
     return rows
+
+
+def _place_left(
+    world: World, rng: np.random.Generator, sensor: Sensor, scans: Sequence[Scan]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws points of the place that the hanging box has left, and their exact distances."""
+    return measures.draw_old_place(world, [HANGING], rng, sensor=sensor, scans=scans)

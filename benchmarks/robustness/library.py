@@ -161,6 +161,11 @@ def lower(state: hio.MapState, points: np.ndarray) -> np.ndarray:
     return _in_chunks(lambda chunk: hio.query(state, chunk).lower, points)
 
 
+def frontier(state: hio.MapState, points: np.ndarray) -> np.ndarray:
+    """Distances (n,) m to unseen space at points (n, 3) m, negative in it."""
+    return _in_chunks(lambda chunk: hio.query(state, chunk).frontier, points)
+
+
 def solid_sdf_and_grad(state: hio.MapState, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) m and gradients (n, 3) at points, with unseen space as an obstacle."""
     value, grad = hio.sdf_and_grad(state, np.asarray(points, np.float32), "obstacle")

@@ -107,21 +107,19 @@ def visible_side(state: hio.MapState, scans: Sequence[Scan], things: Sequence[in
     }
 
 
-def old_place(
-    state: hio.MapState,
+def draw_old_place(
     world: World,
     things: Sequence[Thing],
     rng: np.random.Generator,
     least: float = 0.0,
     sensor: Sensor | None = None,
     scans: Sequence[Scan] = (),
-) -> Figures:
-    """Scores the place that a thing has left.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws points of the place that a thing has left.
 
     Nothing can be known of a part of it that lies outside a sensor's field of view.
 
     Args:
-        state: The map.
         world: The world without it there.
         things: The parts of the thing where they were.
         rng: Source of randomness.
@@ -130,15 +128,29 @@ def old_place(
         scans: Its scans of the world as it is now.
 
     Returns:
-        `old`, `old_lower` and `old_network`, the shares of the place where the map, its lower bound
-        and the network alone reach 90 % of the true distance.
+        Points (n, 3) m and exact distances (n,) m.
     """
     points = np.concatenate([draw_inside(each, _OLD_PLACE_POINTS, 0.0, rng) for each in things])
     if sensor is not None:
         poses = [each.pose for each in scans]
         points = points[is_visible(sensor, poses, world, points, _GAP)]
     truth = world.distance(points)
-    points, needed = points[truth >= least], _REACHED * truth[truth >= least]
+    return points[truth >= least], truth[truth >= least]
+
+
+def old_place(state: hio.MapState, points: np.ndarray, truth: np.ndarray) -> Figures:
+    """Scores the place that a thing has left.
+
+    Args:
+        state: The map.
+        points: Points of the place, (n, 3) m.
+        truth: Exact distances without the thing, (n,) m.
+
+    Returns:
+        `old`, `old_lower` and `old_network`, the shares of the place where the map, its lower bound
+        and the network alone reach 90 % of the true distance.
+    """
+    needed = _REACHED * truth
     return {
         "old": float(np.mean(library.sdf(state, points) >= needed)),
         "old_lower": float(np.mean(library.lower(state, points) >= needed)),

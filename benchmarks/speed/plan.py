@@ -6,7 +6,17 @@ import functools
 from collections.abc import Callable
 
 import hiosdf_jax as hio
-from benchmarks.speed import fleets, limits, networks, processes, queries, scaling, stages, updates
+from benchmarks.speed import (
+    fleets,
+    limits,
+    meshes,
+    networks,
+    processes,
+    queries,
+    scaling,
+    stages,
+    updates,
+)
 from benchmarks.speed.rows import Measured
 from benchmarks.speed.setup import Setup
 from hiosdf_jax._src.state.pytrees import MapState
@@ -72,6 +82,8 @@ def make_plan(setup: Setup) -> dict[str, Task]:
     tasks["points one by one"] = lambda: queries.query_points_one_by_one(
         queried, hio.snapshot(state(queried)), sizes
     )
+    if sizes.whole_run:
+        tasks["meshes"] = lambda: meshes.extract_meshes(setup, last)
     tasks["fleet"] = lambda: fleets.maps_at_once(sizes.fleet, seconds)
     tasks["compiling by sizes"] = lambda: scaling.compile_updates(setup, last)
     tasks["donated updates"] = lambda: updates.donated_updates(setup, last)

@@ -47,7 +47,7 @@ class Sizes:
         cloud_sizes: Points per cloud.
         map_edges: Edges of square maps as high as the stream's bounds, m.
         endurance: Updates in a row.
-        whole_run: Whether to run `hiosdf map` over the whole stream.
+        whole_run: Whether to run `hiosdf map` over the whole stream, and to extract its mesh.
     """
 
     configs: tuple[str, ...]

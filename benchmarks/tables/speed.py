@@ -53,6 +53,8 @@ def cpu() -> str:
         "`hiosdf map` of the house: maps, scores, draws": "hiosdf map, the whole stream, light",
         "its peak of resident memory": "resident memory, peak of hiosdf map",
         "the map's arrays": "arrays of the map, light",
+        "`extract_mesh` of the house, 5 cm": "mesh of 0.05 m, light",
+        "`extract_mesh` of the house, 2.5 cm": "mesh of 0.025 m, light",
         "102,400 distances with gradient, `Config.light`": f"{_QUERY}, blended, light",
         "102,400 distances with gradient, the grid alone": f"{_QUERY}, grid, light",
         "102,400 distances with gradient, the paper's network": f"{_QUERY}, the paper's network",
@@ -64,7 +66,7 @@ def cpu() -> str:
     for label, name in rows.items():
         row = _row(record, name)
         beside = _beside(record, name) if "the paper's" in name else {}
-        unit = row["unit"]
+        unit = row.get("unit", "")
         cells.append([label, *(_with_unit(one, unit) for one in (row, beside))])
     return lay_out(["two CPU cores", "median", "PyTorch eager"], cells)
 
