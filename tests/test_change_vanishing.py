@@ -11,6 +11,7 @@ from room import arrays_equal
 from voxels import CONFIG, SHAPE, empty_window, fuse, fuse_hits, rays_to, trace_rays
 
 from hiosdf_jax._src.change import directions, vanishing
+from hiosdf_jax._src.numerics.shifts import count_around
 
 SENSOR = np.array([-0.25, 0.55, 0.65])
 CELL = (6, 5, 4)  # its center is (0.35, 0.55, 0.65)
@@ -363,16 +364,11 @@ def test_rays_that_are_not_in_range_change_nothing():
     assert arrays_equal(drop(CONFIG, window, window, rays, 0), window)
 
 
-@pytest.mark.parametrize("at_border", [False, True])
-def test_vanished_neighbors_against_a_loop(at_border):
+@pytest.mark.parametrize("rows", [5, 200])
+@pytest.mark.parametrize("reach", [2, 4])
+def test_voxels_around_some_rows_are_those_around_all(reach, rows):
     rng = np.random.default_rng(0)
-    change = np.where(rng.random(SHAPE) < 0.5, rng.integers(-72, 9, SHAPE), 0).astype(np.int8)
-    every = np.stack(np.indices(SHAPE), axis=-1).reshape(-1, 3)
-    inner = np.all((every >= 2) & (every < np.subtract(SHAPE, 2)), axis=1)
-    rows = np.flatnonzero(inner != at_border)
-    around, inside = jax.jit(vanishing._around, static_argnums=0)(SHAPE, jnp.asarray(rows))
-    found = np.sum(np.asarray(inside) & (change.ravel() < -64)[np.asarray(around)], axis=1)
-    cells = np.argwhere(change < -64)
-    expected = [np.sum(np.abs(cells - every[row]).max(axis=1) <= 2) for row in rows]
-    assert max(expected) > 4
-    np.testing.assert_array_equal(found, expected)
+    mask = jnp.asarray(rng.random((12, 9, 10)) < 0.2)
+    row = jnp.asarray(np.concatenate([[0, mask.size - 1], rng.integers(mask.size, size=rows)]))
+    found = jax.jit(vanishing._count_around_rows, static_argnums=2)(mask, row, reach)
+    np.testing.assert_array_equal(found, count_around(mask, reach).ravel()[row])

@@ -153,15 +153,15 @@ def drop_vanished(
 
     def spread(vanished: jax.Array) -> jax.Array:
         """Adds the remains of objects: edges that few rays meet vanish with their objects."""
-        around, inside = _around(change.shape, row)
-        mapped = inside & (window.hits.ravel()[around] > 0)
+        mapped = window.hits > 0
+        mapped_around = _count_around_rows(mapped, row, 2)
 
         def once(_: jax.Array, vanished: jax.Array) -> jax.Array:
             now = put(change, jnp.where(vanished, mark, counted))
-            thing = where_things_left(now).ravel()[row]
-            gone = has_vanished(now).ravel()[around]
-            count = jnp.sum(inside & gone, axis=1)
-            left = jnp.sum(mapped & ~gone, axis=1)
+            gone = has_vanished(now)
+            thing = _count_around_rows(gone, row, _THING_REACH) >= _THING_VOXELS
+            count = _count_around_rows(gone, row, 2)
+            left = mapped_around - _count_around_rows(mapped & gone, row, 2)
             most = looked_at.ravel()[row] | (count >= _LEAST_GONE_RATIO * left)
             # `left` counts the patch itself.
             remnant = thing & looked_past & (missed | (left <= 1))
@@ -179,12 +179,25 @@ def drop_vanished(
     return clear_patches(window, jnp.where(vanished, voxel, voxels), mark)
 
 
-def _around(shape: tuple[int, ...], row: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Finds the 5 x 5 x 5 voxels around each row of a raveled window, and which are inside."""
-    steps = np.stack(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
-    index = jnp.stack(jnp.unravel_index(row, shape), axis=-1)[:, None] + steps
-    inside = jnp.all((index >= 0) & (index < jnp.asarray(shape)), axis=-1)
-    return geometry.flat_index(shape, split(jnp.where(inside[..., None], index, 0))), inside
+def _count_around_rows(mask: jax.Array, row: jax.Array, reach: int) -> jax.Array:
+    """Counts the voxels of a mask in the cubes around some voxels, as `count_around` does for all.
+
+    Args:
+        mask: (X, Y, Z) bool.
+        row: Indices into the raveled mask, (N,) int32.
+        reach: Half the edge of the cubes, without the voxel itself.
+
+    Returns:
+        (N,) int32.
+    """
+    edge = 2 * reach + 1
+    if mask.size <= edge**3 * row.size:
+        return count_around(mask, reach).ravel()[row].astype(jnp.int32)
+    steps = np.stack(np.indices(3 * (edge,)), axis=-1).reshape(-1, 3) - reach
+    index = jnp.stack(jnp.unravel_index(row, mask.shape), axis=-1)[:, None] + steps
+    inside = jnp.all((index >= 0) & (index < jnp.asarray(mask.shape)), axis=-1)
+    around = geometry.flat_index(mask.shape, split(jnp.where(inside[..., None], index, 0)))
+    return jnp.sum(inside & mask.ravel()[around], axis=1, dtype=jnp.int32)
 
 
 def is_recent(change: jax.Array) -> jax.Array:

@@ -78,12 +78,12 @@ def count_around(mask: jax.Array, reach: int) -> jax.Array:
 
     Args:
         mask: (X, Y, Z) bool. Voxels outside of it count as False.
-        reach: Half the edge of the cube, without the voxel itself.
+        reach: Half the edge of the cube, without the voxel itself; at most 15.
 
     Returns:
-        (X, Y, Z) int32.
+        (X, Y, Z) int16.
     """
-    counts = mask.astype(jnp.int32)
+    counts = mask.astype(jnp.int16)
     for axis in range(mask.ndim):
         padded = pad_axis(counts, axis, reach)
         counts = sum(
