@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
 from benchmarks import records
+from benchmarks.accuracy import unseen
 from benchmarks.accuracy.gradient_parts import Part
 from benchmarks.accuracy.results import load_peers
 from benchmarks.tables.markdown import lay_out
@@ -100,6 +102,20 @@ def parts() -> str:
     return lay_out(["`Config.default`", *columns], rows)
 
 
+def unseen_space() -> str:
+    """Errors of each part of a map in unseen space."""
+    record, rows = records.read(unseen.RECORD), []
+    for config in ("light", "default"):
+        for (low, high), row in zip(
+            itertools.pairwise(unseen.DEPTHS_M), record[config]["rows"], strict=True
+        ):
+            label = f"`Config.{config}`, {100 * low:.0f} to {100 * high:.0f} cm deep"
+            errors = (row["error_cm"][name] for name in ("grid", "network", "blended"))
+            rows.append([label, f"{row['points']:,}", *(f"{error:.1f}" for error in errors)])
+    columns = ["points", "the grid alone", "the network alone", "both, as served"]
+    return lay_out(["error in unseen space, cm", *columns], rows)
+
+
 def ablation() -> str:
     """What each part of the pipeline brings on the first 20 frames of the LiDAR."""
     rows = []
@@ -183,6 +199,7 @@ TABLES = {
     "mesh": mesh,
     "steps": steps,
     "gradient-parts": gradient_parts,
+    "unseen-space": unseen_space,
     "training": training,
 }
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from benchmarks import records
 from benchmarks.robustness import figures
+from benchmarks.robustness import vanishing as vanish
 from benchmarks.tables.markdown import lay_out
 
 Checks = dict[tuple[str, str], figures.Check]
@@ -45,7 +48,31 @@ def faults() -> str:
     return lay_out(["error with a fault : error without", *_columns()], cells)
 
 
-TABLES = {"robustness-bars": bars, "robustness-missed": missed, "robustness-faults": faults}
+def vanishing() -> str:
+    """Scans until the place of a thing that has left is free."""
+    record = records.read(vanish.RECORD)
+    sensors = {"camera": "camera", "lidar": "LiDAR"}
+    rows = [
+        [
+            "3 (default)" if vanish_scans == "3" else vanish_scans,
+            *(_scans(found[sensor][answer]) for sensor in sensors for answer in vanish.ANSWERS),
+        ]
+        for vanish_scans, found in record["vanish_scans"].items()
+    ]
+    columns = [
+        f"{label}: `{answer}`" if answer != "network" else f"{label}: the network alone"
+        for label in sensors.values()
+        for answer in vanish.ANSWERS
+    ]
+    return lay_out(["`vanish_scans`", *columns], rows)
+
+
+TABLES = {
+    "robustness-bars": bars,
+    "robustness-missed": missed,
+    "robustness-faults": faults,
+    "vanishing": vanishing,
+}
 
 _RECORD = records.RESULTS / "robustness.json"
 _CONFIGS = {"light": "`Config.light`, CPU", "default": "`Config.default`, H200"}
@@ -59,6 +86,13 @@ _HAPPENINGS = {
     "apartment": "an apartment with a door, a chair and a person",
     "house": "faults of the sensor and of poses",
 }
+
+
+def _scans(freed: dict[str, Any]) -> str:
+    """A number of scans, or the share that is free after the last one."""
+    if freed["scans"] is None:
+        return f"not in {vanish.MOST_SCANS} ({freed['share']:.2f})"
+    return str(freed["scans"])
 
 
 def _columns() -> list[str]:
