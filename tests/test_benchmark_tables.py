@@ -124,21 +124,22 @@ def test_records_are_small():
     assert sum(len(path.read_text().splitlines()) for path in RECORDS) <= 3000
 
 
-def test_a_record_has_one_line_for_each_innermost_part(tmp_path):
+def test_short_innermost_parts_of_a_record_stand_side_by_side(tmp_path):
     value = {"a": [1, 2.5], "b": {"c": {"d": math.nan, "e": "x"}, "f": True}, "g": [[0], {}]}
+    value |= {"h": "y" * 60, "i": "z" * 60, "j": 0}
     path = tmp_path / "new" / "record.json"
     records.write(path, value)
     assert path.read_text().splitlines() == [
         "{",
         ' "a": [1, 2.5],',
         ' "b": {',
-        '  "c": {"d": null, "e": "x"},',
-        '  "f": true',
+        '  "c": {"d": null, "e": "x"}, "f": true',
         " },",
         ' "g": [',
-        "  [0],",
-        "  {}",
-        " ]",
+        "  [0], {}",
+        " ],",
+        f' "h": "{"y" * 60}",',
+        f' "i": "{"z" * 60}", "j": 0',
         "}",
     ]
     value["b"]["c"]["d"] = None
