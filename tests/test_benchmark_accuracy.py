@@ -17,7 +17,7 @@ from room import CONFIG, HALF
 import hiosdf_jax as hio
 from benchmarks import records
 from benchmarks.accuracy import __main__ as command
-from benchmarks.accuracy import figure, gate, gradient_parts, measure, results, sources
+from benchmarks.accuracy import figure, gate, gradient_parts, measure, results, sources, unseen
 from hiosdf_jax import datasets, scoring
 from hiosdf_jax._src.field.compiled import CompiledQueries
 from hiosdf_jax._src.grid.lookup import grid_sdf
@@ -435,3 +435,24 @@ def test_the_error_of_the_gradient_is_split_by_its_first_reason(monkeypatch):
     assert [part.mean for part in parts.values()] == [2, 0, 0, 0, 0]
     bent = gradient_parts.split_error(state, points, up, lambda at: np.abs(at).max(axis=1))
     assert bent["the true gradient turns within 1.5 cm"].share > 0
+
+
+def test_unseen_points_are_scored_by_their_depth(monkeypatch):
+    config = hio.Config.light(((0, 0, 0), (1, 1, 1)), voxel_size=0.1)
+    state = hio.init(config, jax.random.key(0))
+    depth = np.array([-0.1, 0.1, 0.2, 0.3, 0.7])  # one seen, four unseen
+    answer = hio.query(state, np.zeros((5, 3)))._replace(frontier=-depth)
+    monkeypatch.setattr(hio, "query", lambda state, points: answer)
+    errors = {"grid": 0.01, "network": 0.02}
+    monkeypatch.setattr(
+        unseen,
+        "VARIANTS",
+        {name: lambda field, at, m=m: (at[:, 0] + m, None) for name, m in errors.items()},
+    )
+    x = np.linspace(0.1, 0.9, 5)
+    truth = scoring.GroundTruth(
+        np.c_[x, x, x], x, np.zeros((5, 3)), np.zeros(5, int), np.zeros((0, 3))
+    )
+    rows = unseen.score_unseen(state, truth)
+    assert [row["points"] for row in rows] == [2, 1, 1]
+    assert rows[0]["error_cm"] == pytest.approx({"grid": 1, "network": 2}, rel=1e-3)

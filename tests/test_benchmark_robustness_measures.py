@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.robustness import library, measures, scenes
+from benchmarks.robustness import library, measures, scenes, vanishing
 from benchmarks.robustness.library import Setup
 from benchmarks.robustness.sensors import SENSORS, depth_camera, lidar
 from benchmarks.robustness.worlds import Box, Capsule, World
@@ -166,3 +166,22 @@ def test_moving_rows_are_counted():
     silent = measures.RowCounts()
     silent.look(None, seen)
     assert silent.figures() == {}
+
+
+def test_scans_are_counted_until_a_place_is_free(monkeypatch):
+    names = ("old", "old_lower", "old_network")
+    shares = [(0.9, 0.1, 0.0), (0.96, 0.2, 0.95), (0.9, 0.94, 1.0)]
+    series = iter([dict(zip(names, each, strict=True)) for each in shares])
+    monkeypatch.setattr(vanishing, "_SCANS_BEFORE", 1)
+    monkeypatch.setattr(vanishing, "MOST_SCANS", 3)
+    monkeypatch.setattr(Setup, "new_map", lambda setup, config: config.vanish_scans)
+    monkeypatch.setattr(library, "play", lambda state, *_: library.Played(state, [], []))
+    monkeypatch.setattr(library, "frontier", lambda state, points: points[:, 0])
+    monkeypatch.setattr(measures, "old_place", lambda *_: next(series))
+    found = vanishing.count_scans(Setup("light", 0), "camera", 6)
+    assert found == {
+        "sdf": (2, 0.9),
+        "lower": (None, 0.94),
+        "network": (2, 1),
+        "frontier": (1, 1.0),
+    }

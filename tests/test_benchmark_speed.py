@@ -20,6 +20,7 @@ from benchmarks.speed import (
     baselines,
     fleets,
     limits,
+    meshes,
     plan,
     processes,
     queries,
@@ -398,3 +399,19 @@ def test_pytorch_computes_the_same_loss_and_takes_the_same_steps():
     theirs_after = torch_siren.loss(model, *tensors, weights).item()
     assert theirs_after < 0.9 * theirs.item()
     assert theirs_after == pytest.approx(float(ours_after), abs=1e-2)
+
+
+def test_meshes_are_timed_after_a_call_that_warms_up(monkeypatch, tmp_path):
+    asked = []
+
+    def extract_mesh(state, resolution):
+        asked.append(resolution)
+        return types.SimpleNamespace(faces=[0] * 2000)
+
+    state = types.SimpleNamespace()
+    monkeypatch.setattr(meshes, "map_frames", lambda *_: updates.Mapped(state, [1.0], 0.0))
+    monkeypatch.setattr(hio, "extract_mesh", extract_mesh)
+    found, _ = meshes.extract_meshes(setup_of(tmp_path, []), "light")
+    assert [row.name for row in found] == ["mesh of 0.05 m, light", "mesh of 0.025 m, light"]
+    assert found[0].spread.count == 3 and found[0].note.startswith("2,000 triangles")
+    assert asked == [0.05] * 4 + [0.025] * 4
