@@ -157,9 +157,12 @@ def test_the_gate_finds_what_got_worse(tmp_path):
     gate.update_baseline(path, "default", record)
     loaded = records.read(path)
     assert loaded["light"]["rows"] == old | {"more": {"solid": [1.0]}}
+    assert loaded["light"]["revision"] == "abc1234"
     assert set(loaded) == {"light", "default"}
-    gate.update_means(path, "light", record | {"rows": {"row": {"solid": [0.9, 1.0]}}})
+    part = record | {"revision": "def5678", "rows": {"row": {"solid": [0.9, 1.0]}}}
+    gate.update_means(path, "light", part)
     loaded = records.read(path)["light"]
+    assert loaded["revision"] == "abc1234, def5678" and loaded["jax"] == "0"
     assert loaded["rows"] == {"row": {"solid": 0.95}, "more": {"solid": [1.0]}}
 
 

@@ -368,7 +368,7 @@ def test_rays_that_are_not_in_range_change_nothing():
 @pytest.mark.parametrize("reach", [2, 4])
 def test_voxels_around_some_rows_are_those_around_all(reach, rows):
     rng = np.random.default_rng(0)
-    mask = jnp.asarray(rng.random((12, 9, 10)) < 0.2)
+    mask = jnp.asarray(rng.random((24, 17, 19)) < 0.2)
     row = jnp.asarray(np.concatenate([[0, mask.size - 1], rng.integers(mask.size, size=rows)]))
     found = jax.jit(vanishing._count_around_rows, static_argnums=2)(mask, row, reach)
     np.testing.assert_array_equal(found, count_around(mask, reach).ravel()[row])

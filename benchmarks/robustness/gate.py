@@ -93,8 +93,14 @@ def _update(
         row: {name: kept(values) for name, values in each.items()}
         for row, each in record["rows"].items()
     }
-    rows = written.get(config_name, {}).get("rows", {}) | measured
-    written[config_name] = record | {"rows": rows}
+    old = written.get(config_name, {"rows": {}})
+    if not old["rows"].keys() <= measured.keys():  # rows of both runs are in it
+        record = record | {
+            key: ", ".join(dict.fromkeys([*old[key].split(", "), record[key]]))
+            for key in ("device", "jax", "revision")
+            if key in old
+        }
+    written[config_name] = record | {"rows": old["rows"] | measured}
     records.write(path, written)
 
 

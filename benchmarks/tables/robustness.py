@@ -78,6 +78,7 @@ _RECORD = records.RESULTS / "robustness.json"
 _CONFIGS = {"light": "`Config.light`, CPU", "default": "`Config.default`, H200"}
 _HAPPENINGS = {
     "": "all",
+    "stands": "a box stands from the start",
     "appears": "a box appears",
     "jumps": "a box jumps by 1.4 m",
     "crosses": "a box crosses the view",

@@ -193,7 +193,7 @@ def _count_around_rows(mask: jax.Array, row: jax.Array, reach: int) -> jax.Array
     edge = 2 * reach + 1
     if mask.size <= edge**3 * row.size:
         return count_around(mask, reach).ravel()[row].astype(jnp.int32)
-    steps = np.stack(np.indices(3 * (edge,)), axis=-1).reshape(-1, 3) - reach
+    steps = np.indices(3 * (edge,)).reshape(3, -1).T - reach
     index = jnp.stack(jnp.unravel_index(row, mask.shape), axis=-1)[:, None] + steps
     inside = jnp.all((index >= 0) & (index < jnp.asarray(mask.shape)), axis=-1)
     around = geometry.flat_index(mask.shape, split(jnp.where(inside[..., None], index, 0)))
