@@ -77,7 +77,7 @@ def jump(setup: Setup) -> Rows:
         late = library.play(early, frames_of(after[SCANS_AFTER:]), name).state
         rng = setup.rng(1)
         figures = (
-            measures.old_place(early, *_place_left(world, rng, sensor, after[:SCANS_AFTER]))
+            measures.old_place(early, *place_left(world, rng, sensor, after[:SCANS_AFTER]))
             | measures.visible_side(early, after[:SCANS_AFTER], [0])
             | measures.solidity(early, JUMPED, rng)
             | measures.bounds_hold(
@@ -85,15 +85,25 @@ def jump(setup: Setup) -> Rows:
             )
         )
         # The network has twice the scans.
-        place = _place_left(world, rng, sensor, after)
+        place = place_left(world, rng, sensor, after)
         figures["old_network"] = measures.old_place(late, *place)["old_network"]
         figures["side_network_cm"] = measures.visible_side(late, after, [0])["side_network_cm"]
         rows[name] = figures
     return rows
 
 
-def _place_left(
+def place_left(
     world: World, rng: np.random.Generator, sensor: Sensor, scans: Sequence[Scan]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws points of the place that the hanging box has left, and their exact distances."""
+    """Draws points of the place that the hanging box has left.
+
+    Args:
+        world: The world without it there.
+        rng: Source of randomness.
+        sensor: The sensor that looks there.
+        scans: Its scans of the world.
+
+    Returns:
+        Points (n, 3) m and exact distances (n,) m.
+    """
     return measures.draw_old_place(world, [HANGING], rng, sensor=sensor, scans=scans)

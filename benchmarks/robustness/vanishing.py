@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks import records
 from benchmarks.robustness import library, measures
-from benchmarks.robustness.changes import HANGING, JUMPED, SCANS_AFTER
+from benchmarks.robustness.changes import HANGING, JUMPED, SCANS_AFTER, place_left
 from benchmarks.robustness.library import Setup
 from benchmarks.robustness.scenes import BOUNDS, MAX_RANGE, ROOM, frames_of, scan_all
 from benchmarks.robustness.sensors import SENSORS
@@ -64,9 +64,7 @@ def count_scans(setup: Setup, sensor_name: str, vanish_scans: int) -> dict[str, 
     state = library.play(state, frames_of(seen), f"{label}: before").state
     numbers = range(_SCANS_BEFORE, _SCANS_BEFORE + MOST_SCANS)
     scans = scan_all(setup, sensor, lambda _: left, numbers)
-    place, truth = measures.draw_old_place(
-        left, [HANGING], setup.rng(1), sensor=sensor, scans=scans[:SCANS_AFTER]
-    )
+    place, truth = place_left(left, setup.rng(1), sensor, scans[:SCANS_AFTER])
     found = dict.fromkeys(ANSWERS, Freed(None, 0.0))
     for number, frame in enumerate(frames_of(scans), start=1):
         state = library.play(state, [frame], label).state

@@ -66,7 +66,7 @@ def cpu() -> str:
     for label, name in rows.items():
         row = _row(record, name)
         beside = _beside(record, name) if "the paper's" in name else {}
-        unit = row.get("unit", "")
+        unit = row["unit"]
         cells.append([label, *(_with_unit(one, unit) for one in (row, beside))])
     return lay_out(["two CPU cores", "median", "PyTorch eager"], cells)
 

@@ -33,7 +33,9 @@ _RIDGE = 1e-5
 
 
 def smooth_ranges(config: Config, rays: Rays) -> Rays:
-    """Replaces ranges by those of planes through the rays around them, plus the mean of the rest.
+    """Replaces ranges by those of planes through the rays around them.
+
+    The differences between ranges and planes are averaged in the same way, and added.
 
     Args:
         config: The map's configuration.

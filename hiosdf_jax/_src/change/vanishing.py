@@ -154,14 +154,13 @@ def drop_vanished(
     def spread(vanished: jax.Array) -> jax.Array:
         """Adds the remains of objects: edges that few rays meet vanish with their objects."""
         mapped = window.hits > 0
-        mapped_around = _count_around_rows(mapped, row, 2)
 
         def once(_: jax.Array, vanished: jax.Array) -> jax.Array:
             now = put(change, jnp.where(vanished, mark, counted))
             gone = has_vanished(now)
             thing = _count_around_rows(gone, row, _THING_REACH) >= _THING_VOXELS
             count = _count_around_rows(gone, row, 2)
-            left = mapped_around - _count_around_rows(mapped & gone, row, 2)
+            left = _count_around_rows(mapped & ~gone, row, 2)
             most = looked_at.ravel()[row] | (count >= _LEAST_GONE_RATIO * left)
             # `left` counts the patch itself.
             remnant = thing & looked_past & (missed | (left <= 1))
